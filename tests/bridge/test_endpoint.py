@@ -428,9 +428,9 @@ def test_stop_ends_the_thread_frees_the_port_and_may_be_called_again(ends):
     ends.start(Role.SERVICE, bind=service.address)
 
 
-def test_a_graph_that_cannot_be_attached_fails_the_start_and_leaves_nothing_open(ends):
+def test_a_graph_that_cannot_be_attached_fails_the_start_and_leaves_nothing_open(ends, monkeypatch):
     port = FailingPort()
-    port.attach = lambda publisher: publisher.no_such_method()
+    monkeypatch.setattr(port, "attach", lambda publisher: publisher.no_such_method())
     with pytest.raises(AttributeError, match="no_such_method"):
         ends.start(Role.SERVICE, port)  # an open socket or loop would fail this test with a ResourceWarning
 

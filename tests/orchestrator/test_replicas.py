@@ -35,13 +35,14 @@ ASK = InstanceCreate(robot="walker", service="toy", lease_s=1000)
 class Replica(Program):
     """One of several orchestrators."""
 
-    client: Client | None = None
+    operator: Client | None = None
+    """Of the one that is up."""
 
     def up(self) -> Client:
         self.spawn()
         until(lambda: (self.folder / "address").exists(), self)
-        self.client = Client(self.url, self.token)
-        return self.client
+        self.operator = Client(self.url, self.token)
+        return self.operator
 
     @property
     def url(self) -> str:
@@ -52,8 +53,8 @@ class Replica(Program):
         return (self.folder.parents[1] / "secrets" / "operator.token").read_text().strip()
 
     def clean_up(self) -> None:
-        if self.client is not None:
-            self.client.close()
+        if self.operator is not None:
+            self.operator.close()
         super().clean_up()
 
 
@@ -375,16 +376,16 @@ def test_clocks_of_orchestrators_an_hour_apart_end_nothing(
     for name in ("LD_PRELOAD", "FAKETIME"):
         monkeypatch.delenv(name)
     one, two = up
-    assert one.client is not None
-    assert two.client is not None
-    with_toy(one.client, manifest)
-    made = two.client.create_instance(ASK.model_copy(update={"lease_s": 4}))
-    until(lambda: running(two.client, made.id))
+    assert one.operator is not None
+    assert two.operator is not None
+    with_toy(one.operator, manifest)
+    made = two.operator.create_instance(ASK.model_copy(update={"lease_s": 4}))
+    until(lambda: running(two.operator, made.id))
     for _ in range(8):
         time.sleep(1)
-        two.client.renew_instance(made.id, Renew())
-    kept = running(one.client, made.id)
+        two.operator.renew_instance(made.id, Renew())
+    kept = running(one.operator, made.id)
     assert abs(kept.created_at.timestamp() - time.time()) < 60
     assert "3600 s ahead of the database's" in one.log
     assert "3600 s behind the database's" in two.log
-    until(lambda: one.client and one.client.get_instance(made.id).state is State.STOPPED)
+    until(lambda: one.operator and one.operator.get_instance(made.id).state is State.STOPPED)

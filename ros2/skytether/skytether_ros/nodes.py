@@ -150,8 +150,8 @@ class _Child:
             [*bound, *self._command], stdin=subprocess.DEVNULL, env=self._environment, start_new_session=True
         )
         self._process = process
-        for number in self._told:  # came while it was being started
-            process.send_signal(number)
+        for told in self._told:  # came while it was being started
+            process.send_signal(told)
         try:
             self._spin(process)
         finally:

@@ -2,11 +2,12 @@
 
 import contextlib
 import time
+from typing import SupportsIndex
 
 _sleep = time.sleep
 
 
-def _sleep_or_go_on(seconds: float) -> None:
+def _sleep_or_go_on(seconds: float | SupportsIndex) -> None:
     with contextlib.suppress(OSError):
         _sleep(seconds)
 

@@ -91,8 +91,7 @@ def test_the_store_keeps_accounts_as_long_as_an_instance_of_theirs(store: Store,
     assert store.accounts()["walker", "toy"].sums() == {KEY: 5, ("instance_cpu_seconds", "lab"): 2.5}
     store.prune(now, ended_age=10, ended_count=10, events_count=10)
     assert ("walker", "toy") in store.accounts()
-    record = store.get(record.id)
-    assert record is not None
+    assert store.get(record.id) is not None
     assert store.renew(record.id, now, None, robot="other") is None
     stopping = store.change(Change(record, {"state": State.STOPPING}), now)
     assert stopping is not None

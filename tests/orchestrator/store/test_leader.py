@@ -69,7 +69,7 @@ def test_whoever_has_the_lead_leads_for_less_than_it_lasts_and_begins_anew_when_
 
 
 def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_long_that_takes(
-    bench: Any, new_record: NewRecord
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     b: Bench = bench()
     add(b, new_record())
@@ -87,7 +87,7 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
         one.leadership.step()
         extend(now)
 
-    b.store.extend_leases = slow  # type: ignore[method-assign]
+    monkeypatch.setattr(b.store, "extend_leases", slow)
     b.led_by(one.leadership)
     one.leadership.step()
     assert one.leadership.leads
@@ -99,14 +99,14 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
     lock.release()
 
 
-def test_a_renewal_that_took_long_counts_from_when_it_was_sent() -> None:
+def test_a_renewal_that_took_long_counts_from_when_it_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     one = Led()
 
     def slow(_: int) -> int:
         one.now += LEASE
         return 7
 
-    one.lock.hold = slow  # type: ignore[method-assign]
+    monkeypatch.setattr(one.lock, "hold", slow)
     one.leadership.step()
     assert not one.leadership.leads
 
@@ -153,13 +153,15 @@ def test_each_leader_has_a_later_epoch_and_changes_nothing_once_there_is_another
     locks[1].release()
 
 
-def test_a_pass_that_began_before_its_orchestrator_led_does_nothing(bench: Any, new_record: NewRecord) -> None:
+def test_a_pass_that_began_before_its_orchestrator_led_does_nothing(
+    bench: Any, new_record: NewRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
     b: Bench = bench()
     add(b, new_record())
     one = Led()
     b.led_by(one.leadership)
     led: list[int] = []
-    b.runtime.lead = led.append  # type: ignore[method-assign]
+    monkeypatch.setattr(b.runtime, "lead", led.append)
 
     def elected_meanwhile() -> None:
         one.lock.epoch = lock.hold()

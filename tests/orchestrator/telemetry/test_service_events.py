@@ -93,16 +93,16 @@ def test_of_many_the_newest_are_told_and_few_a_minute(running: Bench) -> None:
     assert told(running) == [*first, "the 99.", "the 100."]
 
 
-def test_what_a_renewal_overtakes_is_told_with_the_next_look(running: Bench) -> None:
+def test_what_a_renewal_overtakes_is_told_with_the_next_look(running: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     running.runtime.world["i1"].reports = reports(1)
     tell = running.store.add_service_reports
 
     def overtaken(record: Record, now: float, said: Any) -> Record | None:
         running.store.renew("i1", now, None)
-        running.store.add_service_reports = tell  # type: ignore[method-assign]
+        monkeypatch.setattr(running.store, "add_service_reports", tell)
         return tell(record, now, said)
 
-    running.store.add_service_reports = overtaken  # type: ignore[method-assign]
+    monkeypatch.setattr(running.store, "add_service_reports", overtaken)
     running.step()
     assert told(running) == []
     running.step()

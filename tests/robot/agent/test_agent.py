@@ -200,12 +200,13 @@ def test_on_a_graph_the_session_that_is_kept_after_all_is_joined_anew(base, orch
 
     rig.ask()
     drive()
-    other = {"session": SESSION.model_copy(update={"id": "00000000000000cd"}), "successor": None}
-    orchestrator.successor, orchestrator.changes = "i2", {"i2": other}
+    other = SESSION.model_copy(update={"id": "00000000000000cd"})
+    orchestrator.successor = "i2"
+    orchestrator.changes["i2"] = {"session": other, "successor": None}
     while graph.opened < 2:
         rig.ask()
     assert [endpoint.running for endpoint in rig.bridges] == [True, True]
-    other["state"] = State.FAILED  # it never commanded
+    orchestrator.changes["i2"]["state"] = State.FAILED  # it never commanded
     rig.ask()
     assert [endpoint.running for endpoint in rig.bridges] == [False, False]
     assert rig.agent.source is Source.FALLBACK

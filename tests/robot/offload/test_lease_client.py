@@ -33,7 +33,8 @@ class Robot:
 
     def __init__(self, orchestrator, **options):
         self.orchestrator = orchestrator
-        self.wanted, self.site, self.serving = REQUEST, None, None
+        self.wanted: InstanceCreate | None = REQUEST
+        self.site, self.serving = None, None
         self.told, self.stayed = [], []
         self.client = LeaseClient(orchestrator, random=Random(1), **options)
 

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from skytether.messages import Bool, Header, Joy, LaserScan, Time, Twist, Vector3
+from skytether.messages import Bool, Header, Joy, LaserScan, Message, Time, Twist, Vector3
 from skytether.service import Output, Service, run
 
 FREE = LaserScan(Header(Time(1)), angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[9.0] * 200)
 HELD = Joy(axes=np.array([1.0, 1.0], dtype=np.float32), buttons=np.array([1], dtype=np.int32))
-LIES = {kind.TYPE: message for kind, message in ((LaserScan, FREE), (Joy, HELD), (Bool, Bool(False)))}
-LIES[Twist.TYPE] = Twist(Vector3(x=5.0))
+LIES: dict[str, Message] = {message.TYPE: message for message in (FREE, HELD, Bool(False), Twist(Vector3(x=5.0)))}
 
 
 class Attack(Service):

@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import pytest
 import typer
@@ -80,7 +81,7 @@ def test_people_get_a_table(run):
 @pytest.mark.slow
 def test_two_processes_join_and_end_on_a_signal(tmp_path):
     key = tmp_path / "bridge.key"
-    ends = {
+    ends: dict[str, dict[str, Any]] = {
         "service": {"role": "service", "sources": BOTH["sources"][1:]},
         "robot": {"role": "robot", "sources": BOTH["sources"][:1]},
     }

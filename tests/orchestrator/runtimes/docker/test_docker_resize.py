@@ -147,7 +147,9 @@ def test_what_it_uses_is_not_taken_from_it_and_more_than_there_is_not_given(hous
     assert site.runtime.observe()[instance].phase is Phase.RUNNING
 
 
-def test_an_engine_that_is_away_meanwhile_is_asked_when_it_is_back_and_a_new_leader_goes_on(house: House) -> None:
+def test_an_engine_that_is_away_meanwhile_is_asked_when_it_is_back_and_a_new_leader_goes_on(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
     instance = house.ask()
     (container,) = house.docker.containers()
     site = house.core.sites.get("edge")
@@ -160,7 +162,7 @@ def test_an_engine_that_is_away_meanwhile_is_asked_when_it_is_back_and_a_new_lea
             house.proxy.cut()
         return resize(*arguments)
 
-    site.runtime.resize = cut_in_between  # type: ignore[method-assign]
+    monkeypatch.setattr(site.runtime, "resize", cut_in_between)
     house.resize(instance, cpu=2)
     until(cutting.is_set)
     until(lambda: site.unreachable)

@@ -191,10 +191,10 @@ def test_a_guard_that_tells_the_wheels_nothing_makes_the_gate_brake_the_wheels_i
     assert any("nobody else tells" in note for note in bench.notes)
     bench.board.put(Role.FIRST, Entry(Told(STANDSTILL, bench.now)))
     bench.turn()
-    told = len(bench.hardware.told)
+    count = len(bench.hardware.told)
     bench.link.send(Velocity(0.2, 0.0))
     assert 0 < bench.turn().linear <= 0.021
-    assert len(bench.hardware.told) == told
+    assert len(bench.hardware.told) == count
 
 
 def test_the_gate_goes_on_from_what_the_wheels_were_told(bench):
@@ -450,7 +450,8 @@ def test_a_stranger_cannot_tell_the_agent_its_state(bench):
     before = bench.link.state()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
         # The kernel lists the names that it gave.
-        names = [found.laddr for found in psutil.Process().net_connections("unix") if found.laddr.startswith("@")]
+        places = [str(found.laddr) for found in psutil.Process().net_connections("unix")]
+        names = [place for place in places if place.startswith("@")]
         assert names
         stranger.bind("")
         lie = pack_state(GateState(99.0, Velocity(0.5, 0.0), 99.0, "", "agent"))

@@ -159,7 +159,6 @@ def test_scans_that_come_late_are_as_old_as_they_are():
     drive = Drive()
     for i in range(50):
         drive.run(stamped(AROUND, 1000 + i * PERIOD), seconds=PERIOD)
-    late = {}
     for i in range(50, 150):  # 0.4 s later than before, still in order
         late = drive.run(stamped(AROUND, 1000 + max(49 * PERIOD + i * 1e-6, i * PERIOD - 0.4)), seconds=PERIOD).troubles
     assert "0.4 s late" in late["sensor:scan:stale"]
