@@ -57,10 +57,7 @@ def test_a_wake_during_a_pass_is_not_lost() -> None:
     loop.stop(PATIENCE)
 
 
-def test_a_pass_that_raises_is_logged_and_not_the_last(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("skytether.orchestrator.scheduling.loops._AFTER_ERROR", 0.0)
+def test_a_pass_that_raises_is_logged_and_not_the_last(caplog: pytest.LogCaptureFixture) -> None:
     second = threading.Event()
     count = 0
 
@@ -72,7 +69,7 @@ def test_a_pass_that_raises_is_logged_and_not_the_last(
         second.set()
         return 1000
 
-    loop = Loop("test", step, time.monotonic)
+    loop = Loop("test", step, time.monotonic, after_error_s=0.0)
     loop.start()
     assert second.wait(PATIENCE)
     loop.stop(PATIENCE)

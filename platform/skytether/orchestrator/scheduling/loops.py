@@ -18,9 +18,16 @@ _SHARE = 0.1
 class Loop:
     """Calls ``step``, which says in how many seconds it wants to be called again; ``wake`` makes that now."""
 
-    def __init__(self, name: str, step: Callable[[], float], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        name: str,
+        step: Callable[[], float],
+        clock: Callable[[], float],
+        after_error_s: float = _AFTER_ERROR,
+    ) -> None:
         """``clock`` is monotonic; it only dates and times the passes."""
         self._step = step
+        self._after_error_s = after_error_s
         self._clock = clock
         self._wake = threading.Event()
         self._ending = False
@@ -56,7 +63,7 @@ class Loop:
             except Exception:
                 # Whatever it is, the next pass looks at everything anew; a dead loop would mend nothing.
                 log.exception("%s: pass failed, trying again", self._thread.name)
-                delay = _AFTER_ERROR
+                delay = self._after_error_s
             self.last_pass = self._clock()
             log.debug("%s: pass of %.2f ms", self._thread.name, (self.last_pass - began) * 1e3)
             self._first.set()
