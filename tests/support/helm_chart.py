@@ -59,7 +59,7 @@ def objects(values: Values, kube: str = NEWEST, apis: tuple[str, ...] = ()) -> d
     """What is rendered, by `KIND/NAME`, without the release's name before it."""
     found: dict[str, Object] = {}
     for name, text in files(values, kube, apis).items():
-        for one in yaml.safe_load_all(text) if name != "NOTES.txt" else ():
+        for one in yaml.load_all(text, Loader=yaml.CSafeLoader) if name != "NOTES.txt" else ():
             if one is not None:
                 key = f"{one['kind']}/{one['metadata']['name'].removeprefix('ns-').removeprefix('demo-skytether-')}"
                 if one["metadata"].get("namespace", "ns") != "ns":
