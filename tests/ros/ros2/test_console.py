@@ -11,6 +11,7 @@ from ros2_nodes import until
 from skytether.messages import decode_plain
 from skytether.robot.config.robot_config import load_config
 from skytether.ros.ros1.arguments import RosArguments
+from skytether.ros.ros2 import console
 from skytether.ros.ros2.console import KEPT, LOG, MAX_TEXT, Console
 
 ROOT = "skytether_console_test"
@@ -82,7 +83,8 @@ def test_a_message_has_the_node_s_logger_the_level_and_a_bound(node, log):
     assert second.level == 40
 
 
-def test_the_level_follows_that_of_the_node_s_logger_and_is_as_before_in_the_end(node, log):
+def test_the_level_follows_that_of_the_node_s_logger_and_is_as_before_in_the_end(node, log, monkeypatch):
+    monkeypatch.setattr(console, "_LOOK_S", 0.02)
     node.joined.set()
     with Console(node, "/one/skytether", ROOT):
         log.debug("not this")
