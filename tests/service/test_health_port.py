@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
+import gc
 import json
 import os
 import socket
 import threading
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -110,6 +113,38 @@ def test_strangers_keep_the_cluster_from_no_answer_however_slowly_and_many_they_
             done.set()
             dripping.join()
     assert (caplog.text, *capfd.readouterr()) == ("", "", "")  # nobody fills the service's log
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning")
+def test_who_comes_in_the_moment_of_the_end_is_closed(grant: Grant, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop sees who comes and that it is to end in one and the same turn."""
+    busy, ending = threading.Event(), threading.Event()
+    loop, answer = asyncio.new_event_loop(), health_port._Answers._answer  # noqa: SLF001 (holds up the loop)
+    tell = loop.call_soon_threadsafe
+
+    def told(*call: Any) -> Any:
+        made = tell(*call)
+        ending.set()
+        return made
+
+    def hold(answers: Any, head: bytes) -> bytes:
+        busy.set()
+        assert ending.wait(30)
+        return answer(answers, head)
+
+    monkeypatch.setattr(loop, "call_soon_threadsafe", told)
+    monkeypatch.setattr(asyncio, "new_event_loop", lambda: loop)
+    monkeypatch.setattr(health_port._Answers, "_answer", hold)  # noqa: SLF001
+    with contextlib.ExitStack() as stack:
+        connect = partial(socket.create_connection, ("127.0.0.1", grant.health_port), 10)
+        with answering(grant):
+            stack.enter_context(connect()).sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
+            assert busy.wait(30)
+            strangers = [stack.enter_context(connect()) for _ in range(20)]
+        gc.collect()
+        for stranger in strangers:
+            with contextlib.suppress(ConnectionResetError):
+                assert stranger.recv(1) == b""
 
 
 def test_without_a_port_nobody_listens(grant: Grant) -> None:

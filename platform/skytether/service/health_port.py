@@ -24,6 +24,7 @@ from typing import Any
 
 from skytether.api.grant import DEFAULT_GRANT_PATH, GRANT_VARIABLE, Grant
 from skytether.api.service_report import FILE_NAME, MOST_BYTES
+from skytether.api.splice import closed
 from skytether.api.usage import write_usage
 
 from .container_usage import container_usage
@@ -61,9 +62,9 @@ def answering(grant: Grant) -> Iterator[None]:
 def _serve(loop: asyncio.AbstractEventLoop, listener: socket.socket, answers: _Answers) -> None:
     server = loop.run_until_complete(asyncio.start_server(answers.connected, sock=listener, limit=_MOST_HEAD))
     loop.run_forever()
+    loop.remove_reader(listener)  # asyncio leaves to the collector whom a closed server has taken and not begun with
+    loop.run_until_complete(answers.end())
     server.close()
-    answers.end()
-    loop.run_until_complete(asyncio.sleep(0))  # who was being answered sees the end
     loop.close()
 
 
@@ -73,12 +74,15 @@ class _Answers:
         self._grant = os.environ.get(GRANT_VARIABLE, DEFAULT_GRANT_PATH)
         self._open: dict[asyncio.StreamWriter, None] = {}
         """Oldest first."""
+        self._ended = False
 
     async def connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer one request, and close."""
         self._open[writer] = None
         if len(self._open) > _MOST_AT_ONCE:
             self._cut(next(iter(self._open)))
+        if self._ended:
+            self._cut(writer)
         try:
             async with asyncio.timeout(_TIMEOUT_S):
                 head = await reader.readuntil(b"\r\n\r\n")
@@ -91,10 +95,14 @@ class _Answers:
         finally:
             self._cut(writer)
 
-    def end(self) -> None:
-        """Cut all that are open."""
+    async def end(self) -> None:
+        """Cut all that are open, and who comes in this very moment; returns when they are closed."""
+        self._ended = True
         for writer in list(self._open):
             self._cut(writer)
+        while others := asyncio.all_tasks() - {asyncio.current_task()}:
+            await asyncio.wait(others)
+        await closed()
 
     def _cut(self, writer: asyncio.StreamWriter) -> None:
         if writer in self._open:
