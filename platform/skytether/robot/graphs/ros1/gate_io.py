@@ -6,22 +6,23 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 
 from skytether.control.admittance import Velocity
 from skytether.guard.clock import now as boottime
-from skytether.messages import Bool, MarkerArray, Message, Twist, Vector3, encode, hash_of
-from skytether.robot.graphs.wheels_watch import NOBODY, Others, WheelsWatch
+from skytether.messages import Bool, MarkerArray, Message, Twist, encode, hash_of
+from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
 
 from ..inbox import Inbox, Topics
+from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
 from .sections import Ros1Way
 
 
-class Ros1Wheels:
+class Ros1Wheels(RosWheels[Node]):
     """The wheels' topic, geometry_msgs/Twist.
 
     Args:
@@ -37,10 +38,9 @@ class Ros1Wheels:
 
     def __init__(self, way: Ros1Way, role: str, fresh_s: float, enable_topic: str = "") -> None:
         self._fresh_s = fresh_s
-        self._node = _start(way, role)
+        super().__init__(_start(way, role))
         topic = resolve(way.cmd_vel, way.namespace)
         self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
-        self._watch = None
         if role == "gate":
             own = [resolve(f"{way.node}_{each}", way.namespace) for each in ("guard", "gate")]
             self._watch = WheelsWatch(topic, own, partial(self._node.master.publishers, topic))
@@ -51,17 +51,12 @@ class Ros1Wheels:
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
-        twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
-        self._publication.publish(encode(twist, "ros1"), boottime() + self._fresh_s)
+        self._publication.publish(encode(twist_of(velocity), "ros1"), boottime() + self._fresh_s)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""
         if self._enable is not None:
             self._enable.publish(encode(Bool(data=level), "ros1"), boottime() + self._fresh_s)
-
-    def full(self) -> bool:
-        """Wheels: never; what nobody takes in time is thrown away."""
-        return False
 
     def unread(self) -> str:
         """Wheels: not known; nothing is acknowledged."""
@@ -71,19 +66,8 @@ class Ros1Wheels:
         """Wheels: the nodes that listen."""
         return frozenset(self._publication.subscribers)
 
-    @property
-    def others(self) -> Others:
-        """Who else publishes the topic; the gate's own looks for that."""
-        return self._watch.others if self._watch is not None else NOBODY
 
-    def close(self) -> None:
-        """Leave the graph."""
-        if self._watch is not None:
-            self._watch.close()
-        self._node.close()
-
-
-class Ros1Sensors:
+class Ros1Sensors(RosSensors[Node]):
     """Topics of the robot's own sensors.
 
     Args:
@@ -96,29 +80,16 @@ class Ros1Sensors:
     """
 
     def __init__(self, way: Ros1Way, topics: Topics, trouble: Callable[[str, str], object]) -> None:
-        self._inbox = Inbox(topics, "ros1", trouble)
-        self._node = _start(way, "sensors")
+        super().__init__(_start(way, "sensors"), Inbox(topics, "ros1", trouble))
         for name, kind in topics.kinds.items():
             topic = resolve(name, way.namespace)
             self._node.subscribe(topic, kind.TYPE, hash_of(kind.TYPE, "ros1"), self._listener(name))
-
-    def stops(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what stops the robot."""
-        return self._inbox.take_stops()
-
-    def read(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what else came since the last turn."""
-        return self._inbox.take()
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._node.close()
 
     def _listener(self, name: str) -> Listener:
         return Listener(lambda data, _: self._inbox.put(name, data))
 
 
-class Ros1Display:
+class Ros1Display(RosGateNode[Node]):
     """A topic for people, visualization_msgs/MarkerArray.
 
     Args:
@@ -130,17 +101,13 @@ class Ros1Display:
     """
 
     def __init__(self, way: Ros1Way, topic: str) -> None:
-        self._node = _start(way, "display")
+        super().__init__(_start(way, "display"))
         kind = MarkerArray.TYPE
         self._publication = self._node.advertise(resolve(topic, way.namespace), kind, hash_of(kind, "ros1"), queue=1)
 
     def publish(self, message: Message) -> None:
         """Display: publish it."""
         self._publication.publish(encode(message, "ros1"))
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._node.close()
 
 
 def _start(way: Ros1Way, role: str) -> Node:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
-from skytether.api.manifest import ANY_TOPIC, TopicSpec
+from skytether.api.manifest import TopicSpec
 from skytether.bridge.port import Port
 from skytether.guard.clock import now as boottime
 from skytether.messages import Encoding, Message, Twist, encode_plain, hash_of, type_of
-from skytether.ros import notes, permissions
+from skytether.ros import notes
 from skytether.ros.followed import Followed
 from skytether.ros.names import Generation, bridge_type, resolve
 from skytether.ros.ros1.followed import taken
@@ -23,12 +22,11 @@ from skytether.ros.ros1.publication import Publication
 from skytether.ros.ros1.subscription import Listener
 from skytether.wire.topic import ANY, Role, Topic
 
-from ...session.topic_table import Offer, robot_table, spoken
+from ...session.topic_table import robot_table, spoken
 from ..graph_base import GraphBase, nowhere
 from ..graph_config import RobotGraphConfig
-from ..wheels_watch import NOBODY, Others, WheelsWatch
-
-_log = logging.getLogger(__name__)
+from ..ros.robot import RosRobot
+from ..wheels_watch import WheelsWatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class Ros1RobotConfig(RobotGraphConfig):
     use_sim_time: bool | None = None
 
 
-class Ros1Robot:
+class Ros1Robot(RosRobot):
     """Implements `skytether.robot.graphs.graph_base.Graph`, and tells how the agent is.
 
     Attributes:
@@ -59,7 +57,8 @@ class Ros1Robot:
     encoding: Encoding = "ros1"
 
     def __init__(self, config: Ros1RobotConfig, node: Node) -> None:
-        self._config = config
+        super().__init__(config)
+        self._config: Ros1RobotConfig = config
         self._node = node
         self._port: Ros1Port | None = None
         self._wheels: Publication | None = None
@@ -75,11 +74,10 @@ class Ros1Robot:
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
         self.base = GraphBase(readings, "ros1", send, idle_s=config.idle_s)
         own = config.names(())
-        self._ends: list[Callable[[], None]] = [
+        self._ends = [
             node.subscribe(own.own(name), cls.TYPE, hash_of(cls.TYPE, "ros1"), self._reader(name))
             for name, cls in readings.items()
         ]
-        self._watch: WheelsWatch | None = None
         if config.wheels is not None:
             find = partial(node.master.publishers, config.wheels)
             self._watch = WheelsWatch(config.wheels, config.drivers or (node.name,), find)
@@ -98,11 +96,6 @@ class Ros1Robot:
             self._diagnostics = self._node.advertise(topic, type_name, hash_of(type_name, "ros1"))
         self._diagnostics.publish(encode_plain(type_name, values, "ros1"))
 
-    @property
-    def others(self) -> Others:
-        """Who else publishes what the wheels listen to."""
-        return self._watch.others if self._watch is not None else NOBODY
-
     def topics(self) -> list[Followed]:
         """How the service's topics, and the robot's own, stand in the graph now; from any thread."""
         found = [] if self._port is None else self._port.topics()
@@ -116,14 +109,10 @@ class Ros1Robot:
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         specs = spoken(specs, "action")
-        names = self._config.names(specs)
-        may = self._config.permissions()
-        permissions.check(may, specs, names, command_topic)
-        for unused in names.unused(self._config.readings):
-            _log.warning("remap.%s has no effect: the service has no such topic", unused)
+        names, may = self._checked(specs, command_topic, self._config.readings)
         sim_time = self.sim_time()
         topics = (
-            *robot_table(specs, self._offers(specs), encoding="ros1"),
+            *robot_table(specs, self._offers(specs), encoding=self.encoding),
             *((CLOCK,) if sim_time and all(spec.name != CLOCK.name for spec in specs) else ()),
             *notes.topics(),
         )
@@ -150,30 +139,9 @@ class Ros1Robot:
         except MasterError:
             return False
 
-    def _offers(self, specs: Sequence[TopicSpec]) -> dict[str, Offer]:
-        rows = [row for spec in specs if spec.kind != "call" for row in spec.rows()]
-        taken = {row.name: row.type for row in rows if row.direction == "in" and row.name != ANY_TOPIC}
-        if any(row.name == ANY_TOPIC for row in rows):
-            taken.update(self._any(set(taken)))
-        return {name: Offer(kind, hash_of(kind, "ros1"), "ros1") for name, kind in taken.items()}
-
-    def _any(self, named: set[str]) -> dict[str, str]:
-        """Topics for a service that takes any, by their names in the graph."""
-        wanted = [resolve(name, self._config.home) for name in self._config.topics]
+    def _types(self, names: Sequence[str]) -> dict[str, str]:
         try:
-            types = self._node.master.topic_types() if wanted else {}
+            types = self._node.master.topic_types() if names else {}
         except (MasterError, RefusedError):
             types = {}
-        if not wanted:
-            _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
-        # One that nobody publishes yet is waited for: its type is told to the service when it comes (`ros.notes`).
-        return {n: bridge_type(types.get(n, ANY)) for n in wanted if n not in named}
-
-    def close(self) -> None:
-        """Leave the graph; the node stays."""
-        if self._watch is not None:
-            self._watch.close()
-        if self._port is not None:
-            self._port.close()
-        for end in self._ends:
-            end()
+        return {name: bridge_type(types.get(name, ANY)) for name in names}

@@ -6,13 +6,13 @@ that is told nothing must stop by itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 from skytether.control.admittance import Velocity
-from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, Vector3, encode, hash_of
-from skytether.robot.graphs.wheels_watch import NOBODY, Others, WheelsWatch
+from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
+from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.join import make_node
@@ -22,13 +22,14 @@ from skytether.ros.ros2.sim_time import GraphClock
 
 from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
+from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
 from .sections import Ros2Way
 
 _STOPS = 10_000
 """Words of a button, bumper or cliff sensor that wait while the gate hangs: minutes of them."""
 
 
-class Ros2Wheels:
+class Ros2Wheels(RosWheels[GraphNode]):
     """The wheels' topic, geometry_msgs/msg/Twist or TwistStamped.
 
     Args:
@@ -44,7 +45,7 @@ class Ros2Wheels:
 
     def __init__(self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "") -> None:
         self._way = way
-        self._node = _start(way, role)
+        super().__init__(_start(way, role))
         self._clock = GraphClock(self._node)
         self._topic = resolve(way.cmd_vel, way.namespace)
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
@@ -54,7 +55,6 @@ class Ros2Wheels:
         self._publication = self._node.publish(
             endpoint, farewell=farewell, farewell_after_s=timing.brakes_s, fresh_s=timing.fresh_s
         )
-        self._watch = None
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
             self._watch = WheelsWatch(self._topic, own, self._publishers)
@@ -65,7 +65,7 @@ class Ros2Wheels:
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
-        twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
+        twist = twist_of(velocity)
         if self._way.cmd_vel_type == TwistStamped.TYPE:
             header = Header(Time.from_seconds(self._clock()), self._way.frame)
             self._publication.put(encode(TwistStamped(header, twist)))
@@ -76,10 +76,6 @@ class Ros2Wheels:
         """Wheels: publish it."""
         if self._enable is not None:
             self._enable.put(encode(Bool(data=level)))
-
-    def full(self) -> bool:
-        """Wheels: never; what nobody takes in time is thrown away."""
-        return False
 
     def unread(self) -> str:
         """Wheels: who listens, if not all of them acknowledge; the middleware does not tell who it is."""
@@ -94,22 +90,11 @@ class Ros2Wheels:
             return frozenset()
         return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))
 
-    @property
-    def others(self) -> Others:
-        """Who else publishes the topic; the gate's own looks for that."""
-        return self._watch.others if self._watch is not None else NOBODY
-
-    def close(self) -> None:
-        """Leave the graph."""
-        if self._watch is not None:
-            self._watch.close()
-        self._node.close()
-
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]
 
 
-class Ros2Sensors:
+class Ros2Sensors(RosSensors[GraphNode]):
     """Topics of the robot's own sensors.
 
     Args:
@@ -122,28 +107,15 @@ class Ros2Sensors:
     """
 
     def __init__(self, way: Ros2Way, topics: Topics, trouble: Callable[[str, str], object]) -> None:
-        self._inbox = Inbox(topics, "cdr", trouble)
-        self._node = _start(way, "sensors")
+        super().__init__(_start(way, "sensors"), Inbox(topics, "cdr", trouble))
         for name, kind in topics.kinds.items():
             endpoint = _endpoint(Kind.SUBSCRIPTION, resolve(name, way.namespace), kind.TYPE)
             if name in topics.stops:  # whatever the gate does meanwhile, none may be pushed out by a release
                 endpoint = replace(endpoint, qos=replace(endpoint.qos, depth=_STOPS), priority=1)
             self._node.subscribe(endpoint, partial(self._inbox.put, name))
 
-    def stops(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what stops the robot."""
-        return self._inbox.take_stops()
 
-    def read(self) -> Iterable[tuple[str, Message]]:
-        """Sensors: what else came since the last turn."""
-        return self._inbox.take()
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._node.close()
-
-
-class Ros2Display:
+class Ros2Display(RosGateNode[GraphNode]):
     """A topic for people, visualization_msgs/msg/MarkerArray.
 
     Args:
@@ -155,17 +127,13 @@ class Ros2Display:
     """
 
     def __init__(self, way: Ros2Way, topic: str) -> None:
-        self._node = _start(way, "display")
+        super().__init__(_start(way, "display"))
         name = resolve(topic, way.namespace)
         self._publication = self._node.publish(_endpoint(Kind.PUBLISHER, name, MarkerArray.TYPE))
 
     def publish(self, message: Message) -> None:
         """Display: publish it."""
         self._publication.put(encode(message))
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._node.close()
 
 
 def _start(way: Ros2Way, role: str) -> GraphNode:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +21,7 @@ from skytether.messages import (
     hash_of,
     type_of,
 )
-from skytether.ros import notes, permissions
+from skytether.ros import notes
 from skytether.ros.followed import Followed
 from skytether.ros.names import resolve
 from skytether.ros.ros2.dialect import Endpoint, Kind
@@ -33,12 +32,11 @@ from skytether.ros.ros2.seam import GraphNode, Handle, Publication
 from skytether.ros.ros2.sim_time import GraphClock
 from skytether.wire.topic import ANY, Role, Topic
 
-from ...session.topic_table import Offer, robot_table, spoken
+from ...session.topic_table import robot_table, spoken
 from ..graph_base import GraphBase, nowhere
 from ..graph_config import RobotGraphConfig
-from ..wheels_watch import NOBODY, Others, WheelsWatch
-
-_log = logging.getLogger(__name__)
+from ..ros.robot import RosRobot
+from ..wheels_watch import WheelsWatch
 
 WHEELS = (Twist.TYPE, TwistStamped.TYPE)
 """What wheels may take: nav2 and ros2_control have the second from Jazzy on."""
@@ -63,7 +61,7 @@ class Ros2RobotConfig(RobotGraphConfig):
     frame: str = "base_link"
 
 
-class Ros2Robot:
+class Ros2Robot(RosRobot):
     """Implements `skytether.robot.graphs.graph_base.Graph`.
 
     Attributes:
@@ -78,11 +76,11 @@ class Ros2Robot:
     encoding: Encoding = "cdr"
 
     def __init__(self, config: Ros2RobotConfig, node: GraphNode, *, clock: Callable[[], float] | None = None) -> None:
-        self._config = config
+        super().__init__(config)
+        self._config: Ros2RobotConfig = config
         self._node = node
         self._clock = clock or GraphClock(node)
         self._port: Ros2Port | None = None
-        self._handles: list[Handle] = []
         self._diagnostics: Publication | None = None
         self._own: list[tuple[str, Handle]] = []
         """Readings and wheels, by the robot's names."""
@@ -93,7 +91,7 @@ class Ros2Robot:
             stand: Message = Twist() if config.cmd_vel_type == Twist.TYPE else TwistStamped()
             endpoint = self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type)
             wheels = node.publish(endpoint, farewell=encode(stand), fresh_s=_FRESH_S)
-            self._handles.append(wheels)
+            self._ends.append(wheels.close)
             self._own.append((config.cmd_vel, wheels))
 
             def send(velocity: bytes) -> None:
@@ -109,9 +107,9 @@ class Ros2Robot:
         self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s)
         for name, cls in readings.items():
             endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
-            self._handles.append(node.subscribe(endpoint, partial(self.base.put, name)))
-            self._own.append((name, self._handles[-1]))
-        self._watch: WheelsWatch | None = None
+            reading = node.subscribe(endpoint, partial(self.base.put, name))
+            self._ends.append(reading.close)
+            self._own.append((name, reading))
         if config.wheels is not None:
             self._watch = WheelsWatch(config.wheels, config.drivers, partial(self._publishers, config.wheels))
 
@@ -132,13 +130,8 @@ class Ros2Robot:
             self._diagnostics = self._node.publish(
                 Endpoint(Kind.PUBLISHER, name, type_name, hash_of(type_name, "cdr"), qos)
             )
-            self._handles.append(self._diagnostics)
+            self._ends.append(self._diagnostics.close)
         self._diagnostics.put(encode_plain(type_name, values, "cdr"))
-
-    @property
-    def others(self) -> Others:
-        """Who else publishes what the wheels listen to."""
-        return self._watch.others if self._watch is not None else NOBODY
 
     def topics(self) -> list[Followed]:
         """How the service's topics, and the robot's own, stand in the graph now; from any thread."""
@@ -154,11 +147,8 @@ class Ros2Robot:
 
     def open(self, specs: Sequence[TopicSpec], command_topic: str) -> tuple[tuple[Topic, ...], Port]:
         specs = spoken(specs, "ros2_action")
-        names = self._config.names(specs)
-        may = self._config.permissions()
-        permissions.check(may, specs, names, command_topic)
-        for unused in names.unused((*self._config.readings, self._config.cmd_vel or "", "/diagnostics")):
-            _log.warning("remap.%s has no effect: the service has no such topic", unused)
+        remapped = (*self._config.readings, self._config.cmd_vel or "", "/diagnostics")
+        names, may = self._checked(specs, command_topic, remapped)
         topics = robot_table(specs, self._offers(specs), encoding=self.encoding)
         if any(spec.name == ANY_TOPIC for spec in specs):
             topics = (*topics, notes.row(Role.ROBOT))
@@ -168,36 +158,15 @@ class Ros2Robot:
         return topics, self._port
 
     def close(self) -> None:
-        """Leave the graph; the node stays."""
-        if self._watch is not None:
-            self._watch.close()
-        if self._port is not None:
-            self._port.close()
-        for handle in self._handles:
-            handle.close()
+        super().close()
         if isinstance(self._clock, GraphClock):
             self._clock.close()
 
     def _stamped(self, twist: Twist) -> TwistStamped:
         return TwistStamped(Header(Time.from_seconds(self._clock()), self._config.frame), twist)
 
-    def _offers(self, specs: Sequence[TopicSpec]) -> dict[str, Offer]:
-        rows = [row for spec in specs for part in spec.parts() if part.kind != "call" for row in part.rows()]
-        taken = {row.name: row.type for row in rows if row.direction == "in" and row.name != ANY_TOPIC}
-        if any(row.name == ANY_TOPIC for row in rows):
-            taken.update(self._any(set(taken)))
-        return {name: Offer(kind, hash_of(kind, "cdr"), self.encoding) for name, kind in taken.items()}
-
-    def _any(self, named: set[str]) -> dict[str, str]:
-        """Topics for a service that takes any, by their names in the graph."""
-        found = {}
-        for name in (resolve(name, self._config.home) for name in self._config.topics):
-            if name not in named:
-                # One that nobody publishes yet is waited for: the port tells its type when it comes (`ros.notes`).
-                found[name] = next((other.type for other in self._node.endpoints(name, Kind.PUBLISHER)), ANY)
-        if not self._config.topics:
-            _log.warning("the service takes any topic; name those that it is to get as topics: [...] in robot.yaml")
-        return found
+    def _types(self, names: Sequence[str]) -> dict[str, str]:
+        return {name: next((other.type for other in self._node.endpoints(name, Kind.PUBLISHER)), ANY) for name in names}
 
     @staticmethod
     def _endpoint(kind: Kind, name: str, type_name: str) -> Endpoint:
