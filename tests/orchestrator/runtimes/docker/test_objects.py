@@ -32,7 +32,7 @@ from skytether.orchestrator.runtimes.docker.engine import Engine, EngineGoneErro
 from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.images import PullMeter, check_credentials, ensure_image
 from skytether.orchestrator.runtimes.docker.launch import Job
-from skytether.orchestrator.runtimes.docker.limits import Limits, limits_of, pull_limits
+from skytether.orchestrator.runtimes.docker.limits import ContainerLimits, limits_of, pull_limits
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
@@ -331,7 +331,9 @@ def described(**state: Any) -> dict[str, Any]:
 
 def test_a_container_is_known_by_its_labels() -> None:
     seen = parse(described())
-    assert seen == Seen("c1", "i1", 3, "running", limits=Limits(64 << 20), host_port=40_123, gpus=frozenset({0, 2}))
+    assert seen == Seen(
+        "c1", "i1", 3, "running", limits=ContainerLimits(64 << 20), host_port=40_123, gpus=frozenset({0, 2})
+    )
     foreign = described()
     foreign["Config"]["Labels"] = None
     assert parse(foreign) is None
@@ -867,15 +869,19 @@ def test_an_engine_that_holds_no_limits_starts_nothing_unless_told(
 @pytest.mark.parametrize(
     ("told", "cores", "means"),
     [
-        ({}, 8, Limits(128 << 20, 1_000_000_000, 102)),
-        ({"needs": {"cpu": 3, "memory_mb": 64}}, 2, Limits(64 << 20, 2_000_000_000, 3072)),
-        ({"needs": {"cpu": 0.001}, "limits": {"cpu": 0.001, "memory_mb": 500}}, 2, Limits(500 << 20, 10_000_000, 2)),
+        ({}, 8, ContainerLimits(128 << 20, 1_000_000_000, 102)),
+        ({"needs": {"cpu": 3, "memory_mb": 64}}, 2, ContainerLimits(64 << 20, 2_000_000_000, 3072)),
+        (
+            {"needs": {"cpu": 0.001}, "limits": {"cpu": 0.001, "memory_mb": 500}},
+            2,
+            ContainerLimits(500 << 20, 10_000_000, 2),
+        ),
     ],
 )
-def test_limits_are_told_and_read_alike(told: dict[str, Any], cores: float, means: Limits) -> None:
+def test_limits_are_told_and_read_alike(told: dict[str, Any], cores: float, means: ContainerLimits) -> None:
     limits = limits_of(spec(**told), cores)
     assert limits == means
     document = limits.document()
     assert document["MemorySwap"] == document["Memory"], "no swap, also after a change"
     assert pull_limits(document) == limits
-    assert pull_limits({"Memory": 5, "NanoCpus": None}) == Limits(5)
+    assert pull_limits({"Memory": 5, "NanoCpus": None}) == ContainerLimits(5)

@@ -13,7 +13,7 @@ _LEAST_CORES = 0.01
 """The kernel gives no less."""
 
 
-class Limits(NamedTuple):
+class ContainerLimits(NamedTuple):
     """Of one container."""
 
     memory: int = 0
@@ -29,16 +29,16 @@ class Limits(NamedTuple):
         return {**swap, "NanoCpus": self.nano_cpus, "CpuShares": self.cpu_shares}
 
 
-NO_LIMITS = Limits()
+NO_LIMITS = ContainerLimits()
 
 
-def limits_of(spec: ServiceSpec, cores: float) -> Limits:
+def limits_of(spec: ServiceSpec, cores: float) -> ContainerLimits:
     """Of a service's container; ``cores``: the engine's machine's, which refuses more."""
     most = max(_LEAST_CORES, min(most_cores(spec), cores))
-    return Limits(most_memory_mb(spec) << 20, int(most * 1e9), max(2, int(spec.needs.cpu * 1024)))
+    return ContainerLimits(most_memory_mb(spec) << 20, int(most * 1e9), max(2, int(spec.needs.cpu * 1024)))
 
 
-def pull_limits(host_config: Mapping[str, Any]) -> Limits:
+def pull_limits(host_config: Mapping[str, Any]) -> ContainerLimits:
     """Out of the engine's description."""
     memory, nano, shares = (int(host_config.get(key) or 0) for key in ("Memory", "NanoCpus", "CpuShares"))
-    return Limits(memory, nano, shares)
+    return ContainerLimits(memory, nano, shares)

@@ -25,7 +25,7 @@ from ..containers import (
     out_of_memory,
 )
 from ..egress import refusal_of
-from .limits import NO_LIMITS, Limits, limits_of, pull_limits
+from .limits import NO_LIMITS, ContainerLimits, limits_of, pull_limits
 from .meter import Usage
 from .options import DockerOptions
 
@@ -103,7 +103,7 @@ class Seen:
     """``created``, ``running``, ``paused``, ``exited``, ``dead``, ``removing``."""
     exit_code: int = 0
     out_of_memory: bool = False
-    limits: Limits = NO_LIMITS
+    limits: ContainerLimits = NO_LIMITS
     host_port: int | None = None
     """Published UDP port; known while it runs."""
     ill: str = ""
