@@ -11,7 +11,7 @@ from typing import Any
 
 from skytether.api.groups import GroupCreate, Stage
 from skytether.api.rest import State
-from skytether.orchestrator.config.settings import Limits, Timing, Weights
+from skytether.orchestrator.config.settings import ServerLimits, Timing, Weights
 from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.domain.security import Secrets
 from skytether.orchestrator.groups.demand import Demand
@@ -78,7 +78,7 @@ class GroupsBench:
             Secrets(self.folder),
             self.metrics,
             Timing(),
-            Limits(),
+            ServerLimits(),
             Weights(),
             clock,
             lambda: None,

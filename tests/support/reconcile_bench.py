@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.api.rest import SiteCreate, Size
-from skytether.orchestrator.config.settings import Limits, Timing, Weights
+from skytether.orchestrator.config.settings import ServerLimits, Timing, Weights
 from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.domain.records import Record
 from skytether.orchestrator.domain.security import Secrets
@@ -54,7 +54,7 @@ class Bench:
         self.woken = 0
         self.metrics = Metrics(list, 64)
         self.overload = Overload(clock.steady)
-        self.limits = Limits(ended_count=1)
+        self.limits = ServerLimits(ended_count=1)
         self.lead: Lead = ALONE
         self.left: Callable[[str], Size] = lambda _: PLENTY
         self.sites = FixedSites()
@@ -91,7 +91,7 @@ class Bench:
         self.sites.add(site)
         return site
 
-    def led_by(self, lead: Lead, limits: Limits | None = None) -> None:
+    def led_by(self, lead: Lead, limits: ServerLimits | None = None) -> None:
         """Begin anew, over the same sites, as who leads by this."""
         self.lead, self.limits = lead, limits or self.limits
         self._start()

@@ -14,7 +14,7 @@ from reconcile_bench import Bench, add
 
 from skytether.api.client import ApiError
 from skytether.api.rest import InstanceCreate, Renew, State, TokenCreate
-from skytether.orchestrator.config.settings import Limits
+from skytether.orchestrator.config.settings import ServerLimits
 from skytether.orchestrator.domain.clock_jump import ClockJump, SharedClock
 from skytether.orchestrator.domain.records import Change, Record
 from skytether.orchestrator.store.store import Store
@@ -107,13 +107,13 @@ def test_ended_instances_are_kept_for_their_time_by_the_databases_clock_not_by_t
     shared.look()
     shared.steady = clock.steady
     b = Bench(tmp_path, store, shared)
-    b.led_by(b.lead, Limits())
+    b.led_by(b.lead, ServerLimits())
     add(b, new_record())
     add(b, new_record("elsewhere", state=State.STOPPED))
     b.step(2)
     b.store.change(Change(b.record(), {"state": State.STOPPING, "stopping_at": shared()}), shared())
     b.step(2)
-    clock.forward(Limits().ended_age - 1)
+    clock.forward(ServerLimits().ended_age - 1)
     b.step()
     assert [b.record(name).state for name in ("i1", "elsewhere")] == [State.STOPPED] * 2, "neither too early"
     clock.forward(61)  # it looks once a minute

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from skytether.orchestrator.access.access import Principal
-from skytether.orchestrator.config.settings import Limits
+from skytether.orchestrator.config.settings import ServerLimits
 from skytether.orchestrator.domain.errors import UnauthenticatedError
 from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.http.admission import RUN, Admission
@@ -61,7 +61,7 @@ class Scene:
         self.knows = Knows()
         self.renewed: list[float] = []
         self.admission = Admission(
-            self.app, self.knows, Limits(**limits), self.overload, RefusalDelay(pause_s), self.renewed.append
+            self.app, self.knows, ServerLimits(**limits), self.overload, RefusalDelay(pause_s), self.renewed.append
         )
 
     async def app(self, scope: Any, receive: Any, send: Any) -> None:

@@ -22,7 +22,7 @@ from skytether.api.rest import (
     Share,
     TopicReport,
 )
-from skytether.orchestrator.config.settings import Limits
+from skytether.orchestrator.config.settings import ServerLimits
 
 ASK = '{"robot": "walker", "service": "toy", "params": {"mass": %s}}'
 
@@ -167,7 +167,7 @@ def test_a_robot_of_a_thousand_topics_renews(http: httpx.Client) -> None:
     body = Renew(report=Report(topics=(row,) * MOST_TOPICS)).model_dump(mode="json")
     answer = http.post("/instances/i1/renew", json=body)
     assert (answer.status_code, answer.json()["title"]) == (404, "Not found")  # of the instance
-    assert len(answer.request.content) < Limits().robot_body_bytes
+    assert len(answer.request.content) < ServerLimits().robot_body_bytes
 
 
 def test_a_report_is_read_up_to_its_first_fault() -> None:

@@ -21,13 +21,13 @@ from uvicorn import Config
 from uvicorn.server import ServerState
 
 from skytether.api.splice import closed
-from skytether.orchestrator.config.settings import Limits
+from skytether.orchestrator.config.settings import ServerLimits
 from skytether.orchestrator.domain.overload import Overload
 from skytether.orchestrator.http.connections import Acceptor, Connection, ConnectionTable, GuardedProtocol, place_of
 
 
 def table(most: int = 100, **limits: int) -> ConnectionTable:
-    return ConnectionTable(Limits(**limits), most)
+    return ConnectionTable(ServerLimits(**limits), most)
 
 
 def came(at: ConnectionTable, address: str = "a", owner: str = "", deadline: float = math.inf) -> Connection:
@@ -149,7 +149,7 @@ async def answers_to(
             listener,
             lambda: make(config, ServerState(), {}),
             None,
-            Limits(idle_s=0.5),
+            ServerLimits(idle_s=0.5),
             100,
             (),
             Overload(),
@@ -260,7 +260,7 @@ async def fail_a_handshake(tls: ssl.SSLContext) -> None:
     """Somebody begins to agree upon TLS, and leaves."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         context: Any = SimpleNamespace(context=tls)
-        door = Acceptor(listener, Plain, context, Limits(), 100, (), Overload())
+        door = Acceptor(listener, Plain, context, ServerLimits(), 100, (), Overload())
         try:
             with socket.create_connection(listener.getsockname()) as stranger:
                 stranger.send(b"\x16\x03\x01\x02\x00\x01\x00")

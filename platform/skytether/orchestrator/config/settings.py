@@ -86,7 +86,7 @@ class Weights(Group):
     """Round trip reckoned for a site that was not measured, when the service names no `max_rtt_ms`."""
 
 
-class Limits(Group):
+class ServerLimits(Group):
     """Bounds of what is kept and taken."""
 
     body_bytes: Count = 1 << 20
@@ -305,7 +305,7 @@ class Settings(Group):
     """What is written down."""
     timing: Timing = Timing()
     """How patient the reconciler is."""
-    limits: Limits = Limits()
+    limits: ServerLimits = ServerLimits()
     """Bounds of what is kept and taken."""
     quotas: Quotas = Quotas()
     """How much one robot, service or site may have."""

@@ -21,7 +21,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..access.access import Principal
-from ..config.settings import Limits
+from ..config.settings import ServerLimits
 from ..domain.errors import TooManyError, UnauthenticatedError
 from ..domain.overload import Overload
 from .connections import CONNECTION
@@ -88,7 +88,7 @@ class Admission:
         self,
         app: ASGIApp,
         authenticator: Authenticator,
-        limits: Limits,
+        limits: ServerLimits,
         overload: Overload,
         refusal_delay: RefusalDelay,
         on_renewed: Callable[[float], None] = lambda _: None,

@@ -21,7 +21,7 @@ from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from ..config.settings import Limits
+from ..config.settings import ServerLimits
 from ..domain.overload import Overload
 from .certificate import LiveCertificate
 
@@ -84,7 +84,7 @@ class Connection:
 class ConnectionTable:
     """Who is here. Decides who else may come in, and who gives way: of all, and of each address and owner. Pure."""
 
-    def __init__(self, limits: Limits, most: int) -> None:
+    def __init__(self, limits: ServerLimits, most: int) -> None:
         """``most``: connections in all."""
         self._limits = limits
         self._most = most
@@ -184,7 +184,7 @@ class GuardedProtocol(HttpToolsProtocol):
 
     connection: Connection
     table: ConnectionTable
-    limits: Limits
+    limits: ServerLimits
     _around = 0
     _head = 0
     """Bytes of the line and of headers that are complete."""
@@ -315,7 +315,7 @@ class Acceptor:
         listener: socket.socket,
         make: Callable[[], Any],
         tls: LiveCertificate | None,
-        limits: Limits,
+        limits: ServerLimits,
         most: int,
         proxies: Iterable[str],
         overload: Overload,

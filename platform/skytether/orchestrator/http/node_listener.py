@@ -45,7 +45,7 @@ from skytether.api.node import (
 )
 from skytether.api.splice import closed, keep_alive
 
-from ..config.settings import Limits
+from ..config.settings import ServerLimits
 from ..domain.errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
 from ..domain.rate_limit import RateLimiter
 from ..nodes.authority import LiveContext, name_in, serial_of
@@ -118,7 +118,7 @@ class NodeListener:
         self._echoes = EchoLooks(echo)
         self._leave = leave
         self._clock = clock
-        self._table = ConnectionTable(Limits(strangers=STRANGERS, connections_per_address=_MOST), _MOST)
+        self._table = ConnectionTable(ServerLimits(strangers=STRANGERS, connections_per_address=_MOST), _MOST)
         self._guesses = RateLimiter(_GUESSES_PER_S, _GUESSES, time.monotonic)
         self._requests = RateLimiter(_REQUESTS_PER_S, _REQUESTS, time.monotonic)
         self._links = RateLimiter(_LINKS_PER_S, LINKS, time.monotonic)

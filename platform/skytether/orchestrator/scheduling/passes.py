@@ -8,7 +8,7 @@ from collections.abc import Callable
 from skytether.api.rest import Size
 
 from ..access.disk_usage import DiskUsage
-from ..config.settings import Limits, Timing, Weights
+from ..config.settings import ServerLimits, Timing, Weights
 from ..domain.overload import Overload
 from ..domain.security import Secrets
 from ..store.leader import ALONE, Lead
@@ -36,7 +36,7 @@ class Passes:
         secrets: Secrets,
         metrics: Metrics,
         timing: Timing,
-        limits: Limits,
+        limits: ServerLimits,
         weights: Weights,
         clock: Callable[[], float],
         wake_placer: Callable[[], None],

@@ -10,7 +10,7 @@ from itertools import zip_longest
 
 from skytether.api.rest import State
 
-from ..config.settings import Limits, Timing
+from ..config.settings import ServerLimits, Timing
 from ..domain.records import Change, Record
 from ..domain.transitions import failed, starting, stopped, waiting
 from ..store.store import Store
@@ -43,7 +43,7 @@ class PlacementPass:
         successors: Successors,
         metrics: Metrics,
         timing: Timing,
-        limits: Limits,
+        limits: ServerLimits,
         clock: Callable[[], float],
         steady: Callable[[], float] = time.monotonic,
     ) -> None:
