@@ -34,7 +34,7 @@ class RouteConfig(Strict):
         return text
 
 
-class Limits(Strict):
+class RelayLimitsConfig(Strict):
     """Bounds; what they mean is said at `RelayLimits`."""
 
     sessions: Annotated[int, Field(ge=1, le=65_536)] = _DEFAULT.sessions
@@ -65,7 +65,7 @@ class RelayConfig(Strict):
     """Where every session goes that no route names; null: it is not forwarded."""
     kubernetes: PodsConfig | None = None
     """Sessions of pods go to these, as they come and go."""
-    limits: Limits = Limits()
+    limits: RelayLimitsConfig = RelayLimitsConfig()
 
     @model_validator(mode="after")
     def _goes_somewhere(self) -> RelayConfig:
