@@ -41,7 +41,7 @@ from ..store.store import KeyReusedError, Store
 from ..telemetry.metrics import Metrics
 from ..telemetry.reports import Reports
 from .catalog import Catalog
-from .placement import Decision, explain_refusals
+from .placement import PlacementDecision, explain_refusals
 from .placer import Placer
 from .site import Site
 from .sites import Sites
@@ -143,7 +143,7 @@ class Instances:
         """As JSON; of sites that are not there nothing is kept, for a robot could make up thousands."""
         return {site: m.model_dump(exclude_none=True) for site, m in measured.items() if self._sites.find(site)}
 
-    def _no_site(self, record: Record, decision: Decision) -> NoSiteError:
+    def _no_site(self, record: Record, decision: PlacementDecision) -> NoSiteError:
         self._metrics.refused(record.service, decision.refused)
         text = f"no site can run '{record.service}': {explain_refusals(record, decision.refused)}"
         return NoSiteError(text, [refusal.model_dump() for refusal in decision.refused])

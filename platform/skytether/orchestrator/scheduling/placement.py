@@ -77,7 +77,7 @@ class Prospect:
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class PlacementDecision:
     """The best site, or None, and why not the others."""
 
     site: str | None
@@ -107,7 +107,7 @@ def place(
     *,
     image: str | None = None,
     weights: Weights = Weights(),  # noqa: B008 (frozen)
-) -> Decision:
+) -> PlacementDecision:
     """Choose a site.
 
     Of those that fit, one that the robot prefers, then the one with the lowest score; at equal scores the nearest tier,
@@ -122,7 +122,7 @@ def place(
     scores.sort(key=lambda s: (s.site not in wanted, s.total_ms, tiers[s.site], s.site))
     refused = tuple(verdict[0] for _, verdict in verdicts if verdict)
     hopeless = all(verdict is not None and verdict[1] for _, verdict in verdicts)
-    return Decision(scores[0].site if scores else None, refused, hopeless, tuple(scores))
+    return PlacementDecision(scores[0].site if scores else None, refused, hopeless, tuple(scores))
 
 
 def score(needs: Needs, measured: Measurement, site: Candidate, weights: Weights) -> Score:

@@ -19,7 +19,7 @@ from ..domain.records import Record
 from ..runtimes.base import Capacity
 from ..store.leader import ALONE, Lead
 from ..store.store import Store
-from .placement import UNSTARTED, Candidate, Decision, Prospect, lacks, place
+from .placement import UNSTARTED, Candidate, PlacementDecision, Prospect, lacks, place
 from .promises import NOTHING, Promises, Sums
 from .site import Site
 from .sites import Sites
@@ -71,7 +71,7 @@ class Placer:
         self._promises_until = -math.inf
         """Steady seconds."""
 
-    def weigh(self, record: Record, promised: Sums | None = None, runs: bool = False) -> Decision:
+    def weigh(self, record: Record, promised: Sums | None = None, runs: bool = False) -> PlacementDecision:
         """Where it would run now, beside what is promised; looks only. ``runs``: it need not be started any more.
 
         Without ``promised``, beside all that is stored.
