@@ -21,7 +21,7 @@ from skytether.orchestrator.runtimes.docker.engine import EngineGoneError
 from skytether.orchestrator.runtimes.docker.follow import Follower
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.namespaces import Namespaces
-from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER, Helper, Namespace, Seen
+from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER, ContainerState, Helper, Namespace
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 PATIENCE = 10.0
@@ -66,14 +66,14 @@ class Scene:
     def info(self, _timeout_s: float) -> dict[str, Any]:
         return {"NCPU": 2}
 
-    def seen(self, _timeout_s: float) -> list[Seen]:
+    def seen(self, _timeout_s: float) -> list[ContainerState]:
         return []
 
-    def of(self, _instance: str) -> list[Seen]:
+    def of(self, _instance: str) -> list[ContainerState]:
         return []
 
-    def look(self, container: str) -> Seen:
-        return Seen(container, "i1", 1, "running")
+    def look(self, container: str) -> ContainerState:
+        return ContainerState(container, "i1", 1, "running")
 
     def forget(self, _container: str) -> None:
         """Nothing is remembered."""
@@ -203,8 +203,8 @@ def test_a_network_in_which_a_container_is_or_is_just_begun_stays_when_its_orche
         def catch_up(self, _timeout_s: float) -> None:
             self.seen_by_now = True
 
-        def seen(self, _timeout_s: float) -> list[Seen]:
-            return [Seen("c1", "i1", 1, "running", namespace="late")] * self.seen_by_now
+        def seen(self, _timeout_s: float) -> list[ContainerState]:
+            return [ContainerState("c1", "i1", 1, "running", namespace="late")] * self.seen_by_now
 
         def remove_container(self, container: str, **_: object) -> None:
             self.calls.append(container)

@@ -16,7 +16,7 @@ from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker import launch as docker_launch
 from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.launch import Job
-from skytether.orchestrator.runtimes.docker.objects import Seen
+from skytether.orchestrator.runtimes.docker.objects import ContainerState
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 PATIENCE = 10.0
@@ -25,10 +25,10 @@ PATIENCE = 10.0
 class Nobody:
     """Follows an engine on which nothing of ours is seen."""
 
-    def seen(self, _timeout_s: float) -> list[Seen]:
+    def seen(self, _timeout_s: float) -> list[ContainerState]:
         return []
 
-    def of(self, _instance: str) -> list[Seen]:
+    def of(self, _instance: str) -> list[ContainerState]:
         return []
 
 
@@ -48,11 +48,11 @@ class House:
         house, anything = self, Nobody()
 
         class Begun(Job):
-            def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], *_: Any) -> Seen:
+            def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], *_: Any) -> ContainerState:
                 house.chosen[instance] = port, gpus
                 if instance == "slow":
                     house.wait()
-                return Seen("c", instance, 1, "running")
+                return ContainerState("c", instance, 1, "running")
 
         key = base64.b64encode(bytes(32)).decode()
         grant = Grant(

@@ -36,9 +36,9 @@ from skytether.orchestrator.runtimes.docker.limits import ContainerLimits, limit
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
+    ContainerState,
     Declared,
     Namespace,
-    Seen,
     advised,
     container,
     data_volume,
@@ -216,7 +216,7 @@ def test_an_engines_refusal_comes_with_what_to_do() -> None:
 
 @pytest.mark.parametrize(("code", "status"), [(0, 0), (3, 3), (127, 127), (137, -9), (139, -11), (255, 255)])
 def test_a_signal_is_told_from_a_status_of_the_programs_own(code: int, status: int) -> None:
-    assert observation(Seen("c", "i1", 1, "exited", exit_code=code), options()).exit_status == status
+    assert observation(ContainerState("c", "i1", 1, "exited", exit_code=code), options()).exit_status == status
 
 
 def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
@@ -239,7 +239,7 @@ def test_published_and_advertised_addresses_are_two_things() -> None:
     asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
     bindings = container(launch(), asked, "me", Declared("x"), 7700, (), 4.0, {})["HostConfig"]["PortBindings"]
     assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
-    seen = observation(Seen("c", "i1", 1, "running", host_port=7700, ready=True), asked)
+    seen = observation(ContainerState("c", "i1", 1, "running", host_port=7700, ready=True), asked)
     assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)
 
 
@@ -331,7 +331,7 @@ def described(**state: Any) -> dict[str, Any]:
 
 def test_a_container_is_known_by_its_labels() -> None:
     seen = parse(described())
-    assert seen == Seen(
+    assert seen == ContainerState(
         "c1", "i1", 3, "running", limits=ContainerLimits(64 << 20), host_port=40_123, gpus=frozenset({0, 2})
     )
     foreign = described()
@@ -752,7 +752,7 @@ def test_one_guard_left_behind_is_litter_where_no_network_is_ready() -> None:
 def test_what_a_start_has_given_up_is_no_run_and_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An engine that is slow started it, and will end it: both without an answer in time."""
     nothing: Any = None
-    begun = Seen("c1", "i1", 3, "running", host_port=40_123, ready=True)
+    begun = ContainerState("c1", "i1", 3, "running", host_port=40_123, ready=True)
     with closing(DockerRuntime("edge", tmp_path, options(engine=f"unix://{tmp_path}/none"))) as runtime:
         monkeypatch.setattr(runtime.follower, "seen", lambda _: [begun])
         monkeypatch.setattr(runtime.follower, "of", lambda _: [begun])
@@ -776,7 +776,11 @@ def test_what_a_start_has_given_up_is_removed_though_nobody_asks_for_it(
 ) -> None:
     """Its instance may have ended before it was begun anew."""
     nothing: Any = None
-    there = [Seen("c1", "i1", 3, "running"), Seen("c2", "i2", 1, "running"), Seen("c3", "i3", 1, "exited")]
+    there = [
+        ContainerState("c1", "i1", 3, "running"),
+        ContainerState("c2", "i2", 1, "running"),
+        ContainerState("c3", "i3", 1, "exited"),
+    ]
     removed: list[str] = []
     monkeypatch.setattr(
         "skytether.orchestrator.runtimes.docker.runtime.remove", lambda *given: removed.append(given[-1])

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
-from skytether.orchestrator.runtimes.docker.objects import Seen, observation, parse
+from skytether.orchestrator.runtimes.docker.objects import ContainerState, observation, parse
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.docker.volumes import Scales, sizes
 
@@ -168,9 +168,9 @@ def test_an_engine_that_never_weighs_is_told_once_and_when_it_does_again(caplog:
 
 def test_what_wrote_too_much_is_seen_so() -> None:
     options = DockerOptions()
-    running = Seen("c", "i1", 1, "running", host_port=7, ready=True, volume="full")
+    running = ContainerState("c", "i1", 1, "running", host_port=7, ready=True, volume="full")
     assert observation(running, options, exceeds="too much").exceeds == "too much"
-    assert observation(Seen("c", "i1", 1, "running"), options, exceeds="too much").exceeds == "too much"
+    assert observation(ContainerState("c", "i1", 1, "running"), options, exceeds="too much").exceeds == "too much"
     assert observation(running, options).phase is Phase.RUNNING
     mounts = [
         {"Destination": "/run/skytether", "Name": "grant"},

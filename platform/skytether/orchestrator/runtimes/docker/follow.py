@@ -26,7 +26,7 @@ from ..base import RuntimeFailure
 from ..containers import last_line
 from .engine import Engine, EngineGoneError, root_cause
 from .meter import Meter
-from .objects import INSTANCE, OWNER, READY, Helper, Seen, carried_over, parse, parse_helper, pull_machine
+from .objects import INSTANCE, OWNER, READY, ContainerState, Helper, carried_over, parse, parse_helper, pull_machine
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class Follower:
         self._mine = {"label": [f"{OWNER}={owner}"]}
         self._on_connect = on_connect
         self._lock = threading.Lock()
-        self._seen: dict[str, Seen] = {}
+        self._seen: dict[str, ContainerState] = {}
         self._helpers: dict[str, Helper] = {}
         self._most = BESIDE
         self._awaited: set[str] = set()
@@ -100,7 +100,7 @@ class Follower:
         if self._thread.is_alive():
             self._thread.join(_QUIET_S)
 
-    def seen(self, timeout_s: float) -> list[Seen]:
+    def seen(self, timeout_s: float) -> list[ContainerState]:
         """All containers of ours; waits for the first look only, ``timeout_s`` [s] at most.
 
         Raises:
@@ -132,7 +132,7 @@ class Follower:
             for seen in run:
                 self._follow_closely(seen)
 
-    def _follow_closely(self, seen: Seen) -> None:
+    def _follow_closely(self, seen: ContainerState) -> None:
         if not self._closing.is_set():
             self.meter.follow(seen.id, self._most)
         if not seen.ready:
@@ -143,7 +143,7 @@ class Follower:
         self._failure = error
         self._end_stream()
 
-    def of(self, instance: str) -> list[Seen]:
+    def of(self, instance: str) -> list[ContainerState]:
         """The containers of one instance as last seen, the earliest run first."""
         with self._lock:
             return sorted((s for s in self._seen.values() if s.instance == instance), key=lambda seen: seen.attempt)
@@ -183,7 +183,7 @@ class Follower:
         except Exception as error:  # as in the thread: an engine may be anybody's
             raise _not_understood(error) from error
 
-    def look(self, container: str) -> Seen | None:
+    def look(self, container: str) -> ContainerState | None:
         """Look at one container now; None: it is not there, or not ours.
 
         Raises:

@@ -25,8 +25,8 @@ from .namespaces import Namespaces
 from .network import close_off, guard_image, is_ours
 from .objects import (
     OWNER,
+    ContainerState,
     Namespace,
-    Seen,
     advised,
     container,
     declared,
@@ -224,19 +224,19 @@ class Job:
     def _must_lead(self) -> None:
         self._fence.must_lead(self._epoch)
 
-    def _is_this(self, seen: Seen) -> bool:
+    def _is_this(self, seen: ContainerState) -> bool:
         """Whether a container is this very run, and was begun."""
         begun = seen.runs or seen.status == "exited"
         return begun and seen.attempt == self.attempt and seen.id not in self.given_up
 
-    def _wait_for_end(self, seen: Seen) -> None:
+    def _wait_for_end(self, seen: ContainerState) -> None:
         deadline = time.monotonic() + _END_S
         while (now := self._follower.look(seen.id)) is not None and now.runs:
             if time.monotonic() > deadline:
                 raise RuntimeFailure("what is left of the run before cannot be ended: see the engine's log")
             time.sleep(0.02)
 
-    def _create(self, image: str, openings: Openings) -> Seen:
+    def _create(self, image: str, openings: Openings) -> ContainerState:
         refused: set[int] = set()
         deadline = time.monotonic() + _END_S
         while True:
@@ -256,7 +256,7 @@ class Job:
                         raise RuntimeFailure(str(error)) from error
                     time.sleep(_AGAIN_S)
 
-    def _begun_by_another(self) -> Seen | None:
+    def _begun_by_another(self) -> ContainerState | None:
         """This run as another orchestrator has begun it, by its container's name; None: there is none any more.
 
         One that was made only is removed: if whoever made it is still at it, it finds nothing to begin.
@@ -309,7 +309,7 @@ class Job:
             first, last = self._options.ports or (0, 0)
             raise RuntimeFailure(f"every UDP port from {first} to {last} is taken (option 'ports')") from None
 
-    def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], openings: Openings) -> Seen:
+    def _begin(self, image: str, port: int | None, gpus: tuple[int, ...], openings: Openings) -> ContainerState:
         """In a network that is prepared, if any may do: what opens something, or has to have a port, needs its own."""
         guard = guard_image(self._engine, self._options) if is_ours(self._engine, self._options.network) else None
         if guard is not None and port is None and not openings:
@@ -331,7 +331,7 @@ class Job:
         openings: Openings,
         guard: str | None,
         namespace: Namespace | None = None,
-    ) -> Seen:
+    ) -> ContainerState:
         """``guard`` is the image that closes the network off; None: it is closed off already, or is not to be."""
         network = self._options.network
         cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
@@ -407,7 +407,7 @@ class _PortTakenError(Exception):
     """Another program on the engine's machine has the port."""
 
 
-def later_runs(seen: Seen) -> str:
+def later_runs(seen: ContainerState) -> str:
     """Why an earlier attempt is not begun."""
     return f"attempt {seen.attempt} of {seen.instance} runs: an earlier one is not begun any more"
 

@@ -93,7 +93,7 @@ class Helper:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ContainerState:
     """One container of ours as the engine describes it."""
 
     id: str
@@ -399,7 +399,7 @@ def _is_word(value: object) -> bool:
     return isinstance(value, str) and len(value) <= _LONGEST
 
 
-def parse(inspected: Mapping[str, Any]) -> Seen | None:
+def parse(inspected: Mapping[str, Any]) -> ContainerState | None:
     """A container out of the engine's description; None: it is not one of ours."""
     labels = inspected["Config"].get("Labels") or {}
     if INSTANCE not in labels or not labels.get(_ATTEMPT, "").isdecimal():
@@ -408,7 +408,7 @@ def parse(inspected: Mapping[str, Any]) -> Seen | None:
     port = published_port(inspected)
     health = state.get("Health") or {}
     volumes = {mount.get("Destination"): str(mount.get("Name", "")) for mount in inspected.get("Mounts") or ()}
-    return Seen(
+    return ContainerState(
         id=inspected["Id"],
         instance=labels[INSTANCE],
         attempt=int(labels[_ATTEMPT]),
@@ -453,7 +453,7 @@ def _complaint(log: Sequence[Mapping[str, Any]]) -> str:
     return said or "its health check fails"
 
 
-def carried_over(new: Seen, old: Seen | None) -> Seen:
+def carried_over(new: ContainerState, old: ContainerState | None) -> ContainerState:
     """What one look knows that the next cannot find out again."""
     if old is None:
         return new
@@ -466,7 +466,7 @@ def carried_over(new: Seen, old: Seen | None) -> Seen:
 
 
 def observation(
-    seen: Seen,
+    seen: ContainerState,
     options: DockerOptions,
     usage: Usage | None = None,
     exceeds: str = "",
@@ -495,7 +495,7 @@ def observation(
     return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds, reports=reports)
 
 
-def _how_it_ended(seen: Seen) -> str:
+def _how_it_ended(seen: ContainerState) -> str:
     if seen.out_of_memory and seen.exit_code:
         return out_of_memory(seen.limits.memory >> 20)
     return ""

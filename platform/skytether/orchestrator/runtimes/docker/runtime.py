@@ -39,7 +39,7 @@ from .limits import limits_of
 from .logs import ContainerLog
 from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
-from .objects import Seen, data_volume, observation, refusal
+from .objects import ContainerState, data_volume, observation, refusal
 from .options import DockerOptions
 from .reports import ReportReader
 from .volumes import Scales, remove_left
@@ -244,7 +244,7 @@ class DockerRuntime(Runtime):
             self.jobs[launch.instance] = job
             job.start()
 
-    def _newest(self, instance: str) -> Seen | None:
+    def _newest(self, instance: str) -> ContainerState | None:
         seen = self.follower.of(instance)
         return seen[-1] if seen else None
 
@@ -280,7 +280,7 @@ class DockerRuntime(Runtime):
         begun = {
             instance for instance, job in jobs.items() if job.ended
         }  # before the look, which shows what came of it
-        newest: dict[str, Seen] = {}
+        newest: dict[str, ContainerState] = {}
         for seen in self.follower.seen(self.options.timeout_s):
             # What a start has given up is no run, however it looks: an engine that answers late still ends it.
             if seen.instance in jobs and seen.id in jobs[seen.instance].given_up:
@@ -341,7 +341,7 @@ class DockerRuntime(Runtime):
             remove(self.engine, self.follower, seen.id)
             self._asked.discard(seen.id)
 
-    def _to_be_ended(self, instance: str) -> list[Seen]:
+    def _to_be_ended(self, instance: str) -> list[ContainerState]:
         """All its containers, none of which a later leader has begun."""
         self.follower.seen(self.options.timeout_s)  # or it could not be known what is there
         there = self.follower.of(instance)
