@@ -22,7 +22,7 @@ from skytether.orchestrator.runtimes.kubernetes.cluster import Cluster
 from skytether.orchestrator.runtimes.kubernetes.health import FAILS, Health
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 from skytether.orchestrator.runtimes.kubernetes.reports import ReportReader
-from skytether.orchestrator.runtimes.kubernetes.seen import Seen
+from skytether.orchestrator.runtimes.kubernetes.seen import PodState
 
 HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
 CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
@@ -165,8 +165,8 @@ def test_nobody_is_asked_whom_a_pod_names(cluster: Callable[..., Cluster]) -> No
     reader.close()
 
 
-def pod(name: str) -> Seen:
-    return cast(Seen, SimpleNamespace(name=name, uid=f"uid-{name}"))
+def pod(name: str) -> PodState:
+    return cast(PodState, SimpleNamespace(name=name, uid=f"uid-{name}"))
 
 
 def says(**document: object) -> Answer:

@@ -29,7 +29,7 @@ from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 from skytether.orchestrator.runtimes.kubernetes.pods import Pods
 from skytether.orchestrator.runtimes.kubernetes.relayed import routes_of
 from skytether.orchestrator.runtimes.kubernetes.resize import quantity
-from skytether.orchestrator.runtimes.kubernetes.seen import Seen, observation, parse
+from skytether.orchestrator.runtimes.kubernetes.seen import PodState, observation, parse
 
 KEY = base64.b64encode(bytes(range(32))).decode()
 
@@ -52,7 +52,7 @@ def made(**given: Any) -> dict[str, Any]:
     return body
 
 
-def seen(state: dict[str, Any] | None = None, phase: str = "Running", **status: Any) -> Seen:
+def seen(state: dict[str, Any] | None = None, phase: str = "Running", **status: Any) -> PodState:
     container = {"name": "service", "state": state or {}, "started": status.pop("started", False)}
     container["ready"] = status.pop("ready", False)
     told = {"phase": phase, "hostIP": "10.0.0.5", "podIP": "10.1.0.9", "containerStatuses": [container], **status}
@@ -61,7 +61,7 @@ def seen(state: dict[str, Any] | None = None, phase: str = "Running", **status: 
     return found
 
 
-def looked_at(found: Seen, external: str = "") -> Observation:
+def looked_at(found: PodState, external: str = "") -> Observation:
     return observation(found, options(), external)
 
 

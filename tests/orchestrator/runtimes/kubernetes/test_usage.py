@@ -13,10 +13,10 @@ from skytether.api.usage import NO_USAGE, Usage
 from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.runtimes.kubernetes.cluster import ClusterGoneError, RefusedError
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
-from skytether.orchestrator.runtimes.kubernetes.seen import Seen, observation
+from skytether.orchestrator.runtimes.kubernetes.seen import PodState, observation
 from skytether.orchestrator.runtimes.kubernetes.usage import Meter, bounded, pull_samples
 
-POD = Seen("p1", "u1", "7", "i1", 1, "64Mi", "500m", made_at=1000.0, phase="Running", running=True, started=True)
+POD = PodState("p1", "u1", "7", "i1", 1, "64Mi", "500m", made_at=1000.0, phase="Running", running=True, started=True)
 
 
 def listed(at: str, cpu: str = "250m", memory: str = "20Mi", window: str = "15s") -> dict[str, Any]:

@@ -19,7 +19,7 @@ from ..now_and_then import NowAndThen
 from .cluster import Cluster, RefusedError
 from .objects import HEALTH_PORT
 from .pace import Pace
-from .seen import Seen
+from .seen import PodState
 
 log = logging.getLogger(__name__)
 
@@ -46,12 +46,12 @@ class Health:
         self._now_and_then = NowAndThen("kubernetes-health", _EVERY_S, clock, self._look)
         self._pace = Pace(_PER_S, 1)
         self._lock = threading.Lock()
-        self._doubted: dict[str, Seen] = {}
+        self._doubted: dict[str, PodState] = {}
         self._troubles: dict[str, str] = {}
         """By uid of a pod that is doubted; empty: it is well."""
         self._closing = False
 
-    def trouble(self, seen: Seen, doubted: bool) -> str:
+    def trouble(self, seen: PodState, doubted: bool) -> str:
         """What is wrong with a service; empty: nothing that is known. Does not wait.
 
         Args:

@@ -12,7 +12,7 @@ from ..containers import INNER_PORT
 from .cluster import Cluster
 from .objects import MANAGED, OWNER
 from .options import KubernetesOptions
-from .seen import Seen
+from .seen import PodState
 from .watch import Watch
 
 log = logging.getLogger(__name__)
@@ -22,9 +22,9 @@ _SESSION = re.compile("[0-9a-f]{16}")
 Address = tuple[str, int]
 
 
-def routes_of(pods: Iterable[Seen]) -> dict[str, Address]:
+def routes_of(pods: Iterable[PodState]) -> dict[str, Address]:
     """Where the newest run of each session listens, as far as it has an address."""
-    newest: dict[str, Seen] = {}
+    newest: dict[str, PodState] = {}
     for seen in pods:
         if seen.ended or not seen.address or not _SESSION.fullmatch(seen.session):
             continue

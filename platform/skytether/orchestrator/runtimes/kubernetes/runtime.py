@@ -49,7 +49,7 @@ from .options import KubernetesOptions
 from .pod_changes import NETWORKING, end_pod, hold_claim, put, remove_pod
 from .reports import ReportReader
 from .resize import SUBRESOURCE, in_class_of, patch, resources_of
-from .seen import Seen, observation, refused
+from .seen import PodState, observation, refused
 from .services import Services
 from .usage import Meter
 from .watch import Watch
@@ -267,7 +267,7 @@ class KubernetesRuntime(Runtime):
             raise RuntimeFailure(f"every UDP port from {ports[0]} to {ports[1]} is taken (option 'ports')")
         return port
 
-    def _give_other_ports(self, there: Iterable[Seen]) -> None:
+    def _give_other_ports(self, there: Iterable[PodState]) -> None:
         """To pods of ours that no node takes, for others have their ports."""
         for seen in there:
             if seen.node or self._over(seen):
@@ -308,9 +308,9 @@ class KubernetesRuntime(Runtime):
             unrun = {instance: self._unrun[instance] for instance in instances if instance in self._unrun}
         return self._observed(there, unrun)
 
-    def _observed(self, there: Iterable[Seen], unrun: Mapping[str, Observation]) -> Mapping[str, Observation]:
+    def _observed(self, there: Iterable[PodState], unrun: Mapping[str, Observation]) -> Mapping[str, Observation]:
         """The newest run of each instance."""
-        newest: dict[str, Seen] = {}
+        newest: dict[str, PodState] = {}
         for seen in there:
             if seen.removed:
                 continue
@@ -336,7 +336,7 @@ class KubernetesRuntime(Runtime):
                 found[instance] = told
         return found
 
-    def _over(self, seen: Seen) -> bool:
+    def _over(self, seen: PodState) -> bool:
         """Whether nothing of it runs any more."""
         return self._watch.over(seen)
 
@@ -353,16 +353,16 @@ class KubernetesRuntime(Runtime):
                 self._delete(seen)
                 self._leave(seen, "was stopped before it ran")
 
-    def _leave(self, seen: Seen, detail: str, *, unstarted: bool = False) -> None:
+    def _leave(self, seen: PodState, detail: str, *, unstarted: bool = False) -> None:
         """Remember how a run ended of which nothing is left."""
         with self._lock:
             self._unrun[seen.instance] = Observation(seen.attempt, Phase.EXITED, detail=detail, unstarted=unstarted)
 
-    def _end(self, seen: Seen, failure: str = "") -> None:
+    def _end(self, seen: PodState, failure: str = "") -> None:
         if (pod := end_pod(self.cluster, seen.name, seen.uid, failure)) is not None:
             self._watch.take(pod)
 
-    def _delete(self, seen: Seen) -> None:
+    def _delete(self, seen: PodState) -> None:
         remove_pod(self.cluster, seen.name, seen.uid, grace_s=1 if seen.node else 0)
         if (
             not seen.node
@@ -428,7 +428,7 @@ class KubernetesRuntime(Runtime):
         self._reports.begin()
         self._meter.begin(there)
 
-    def _give_up_unbalanced(self, there: Iterable[Seen]) -> None:
+    def _give_up_unbalanced(self, there: Iterable[PodState]) -> None:
         """Those to which no load balancer passes on."""
         up = [seen for seen in there if seen.running and seen.started and not seen.stops and not self._over(seen)]
         ready = {seen.instance: seen for seen in up}
@@ -448,7 +448,7 @@ class KubernetesRuntime(Runtime):
                 self._delete(seen)
         self._begun &= {seen.uid for seen in self._watch.seen(self.options.timeout_s)}
 
-    def _is_begun(self, seen: Seen) -> bool:
+    def _is_begun(self, seen: PodState) -> bool:
         if seen.uid in self._begun:
             return True
         try:

@@ -33,7 +33,7 @@ _HOPELESS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class PodState:
     """One pod of ours as the API server describes it."""
 
     name: str
@@ -102,7 +102,7 @@ class Seen:
         return over or bool(self.failure) or self.exit_code is not None
 
 
-def parse(document: Document) -> Seen | None:
+def parse(document: Document) -> PodState | None:
     """A pod out of its description; None: it is not one of ours."""
     meta, spec, status = document["metadata"], document["spec"], document.get("status") or {}
     labels, notes = meta.get("labels") or {}, meta.get("annotations") or {}
@@ -123,7 +123,7 @@ def parse(document: Document) -> Seen | None:
     claims = [one["persistentVolumeClaim"]["claimName"] for one in spec.get("volumes") or () if one.get(_CLAIM)]
     if _CLAIM.lower() in waits_for.lower() and claims:
         waits_for += f" ('kubectl describe pvc {claims[0]}' says why; site's option 'storage_class')"
-    return Seen(
+    return PodState(
         name=meta["name"],
         uid=meta["uid"],
         version=meta.get("resourceVersion", ""),
@@ -199,7 +199,7 @@ def refused(message: str) -> str:
 
 
 def observation(
-    seen: Seen,
+    seen: PodState,
     options: KubernetesOptions,
     external: str = "",
     reports: tuple[ServiceReport, ...] = (),
@@ -257,7 +257,7 @@ def observation(
     return Observation(seen.attempt, Phase.STARTING, detail=seen.waits_for, unstarted=not seen.node, reports=reports)
 
 
-def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, int | None]:
+def where(seen: PodState, options: KubernetesOptions, external: str) -> tuple[str, int | None]:
     """Host and port at which robots reach it."""
     if options.reach == "pod":
         return seen.address, INNER_PORT
@@ -266,7 +266,7 @@ def where(seen: Seen, options: KubernetesOptions, external: str) -> tuple[str, i
     return options.advertise_host or external or seen.host, seen.host_port
 
 
-def _detail(seen: Seen, usage: Usage) -> str:
+def _detail(seen: PodState, usage: Usage) -> str:
     if seen.ended_how == "OOMKilled":
         text = out_of_memory(int(quantity(seen.memory_limit)) >> 20)
         used = usage.memory_bytes

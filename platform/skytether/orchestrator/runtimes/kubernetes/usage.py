@@ -22,7 +22,7 @@ from ..now_and_then import NowAndThen
 from .cluster import Cluster, RefusedError
 from .objects import OWNER
 from .resize import quantity
-from .seen import Seen
+from .seen import PodState
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ def _seconds(text: str) -> float:
     return 60 * float(minutes or 0) + float(seconds.removesuffix("s") or 0)
 
 
-def bounded(told: Usage, seen: Seen, now: float) -> Usage:
+def bounded(told: Usage, seen: PodState, now: float) -> Usage:
     """What a service says, as far as its container can have used it; ``now``: seconds since the epoch."""
     cpu_s, memory = told.cpu_s, told.memory_bytes
     if cpu_s is not None and seen.cpu_limit:
@@ -103,7 +103,7 @@ class Meter:
         self._last: dict[str, Usage] = {}
         """By uid, what was last known while it ran."""
 
-    def of(self, seen: Seen) -> Usage:
+    def of(self, seen: PodState) -> Usage:
         """What a run has used, as far as is known; what has ended, until then."""
         if not seen.running:
             return self._last.get(seen.uid, NO_USAGE)
@@ -115,7 +115,7 @@ class Meter:
             self._last[seen.uid] = usage
         return usage
 
-    def begin(self, there: Iterable[Seen]) -> None:
+    def begin(self, there: Iterable[PodState]) -> None:
         """Look, unless that is under way or was done a moment ago, and forget all but these. Does not wait."""
         uids = {seen.uid for seen in there}
         self._last = {uid: usage for uid, usage in self._last.items() if uid in uids}

@@ -15,7 +15,7 @@ from .cluster import Cluster, RefusedError
 from .follow import AGAIN_S, Document, Follower
 from .objects import GRACE_S
 from .pods import Pods
-from .seen import Seen, parse
+from .seen import PodState, parse
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Watch(Follower):
         self._fail(error)
         self._cut()
 
-    def seen(self, timeout_s: float) -> list[Seen]:
+    def seen(self, timeout_s: float) -> list[PodState]:
         """All pods of ours; waits for the first list only, ``timeout_s`` [s] at most.
 
         Raises:
@@ -61,7 +61,7 @@ class Watch(Follower):
         with self._lock:
             return self._pods.all()
 
-    def of(self, instance: str, timeout_s: float) -> list[Seen]:
+    def of(self, instance: str, timeout_s: float) -> list[PodState]:
         """The pods of one instance, the newest run last; raises as ``seen``."""
         self._must_know(timeout_s)
         with self._lock:
@@ -73,14 +73,14 @@ class Watch(Follower):
         if failure is not None:
             raise type(failure)(*failure.args) if not isinstance(failure, RefusedError) else failure
 
-    def over(self, seen: Seen) -> bool:
+    def over(self, seen: PodState) -> bool:
         """Whether nothing of it runs any more."""
         if seen.ended or not seen.lingers:
             return seen.ended
         now = time.monotonic()
         return now - self._lingers_since.setdefault(seen.uid, now) > _LINGERS_S
 
-    def ill(self, seen: Seen) -> bool:
+    def ill(self, seen: PodState) -> bool:
         """Whether the health check of a service that is up fails, and not only has not been done yet."""
         if seen.healthy:
             self._well.add(seen.uid)
@@ -100,7 +100,7 @@ class Watch(Follower):
         """
         self._list()
 
-    def forget(self, seen: Seen) -> None:
+    def forget(self, seen: PodState) -> None:
         """It was removed: no event that is late brings it back."""
         with self._lock:
             there = self._pods.get(seen.name)
@@ -148,7 +148,7 @@ class Watch(Follower):
 
     def _list(self) -> str:
         """The version of the list."""
-        found: dict[str, Seen] = {}
+        found: dict[str, PodState] = {}
 
         def take(document: Document) -> None:
             seen = parse(document)
@@ -180,7 +180,7 @@ class Watch(Follower):
         self.take(document, gone=gone)
 
 
-def _is_newer(seen: Seen, before: Seen) -> bool:
+def _is_newer(seen: PodState, before: PodState) -> bool:
     return seen.uid != before.uid or _number(seen.version) >= _number(before.version)
 
 
