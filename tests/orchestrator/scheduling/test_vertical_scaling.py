@@ -23,8 +23,8 @@ from skytether.orchestrator.scheduling.vertical_scaling import (
     PAUSE_S,
     ROOM_MB,
     WINDOW_S,
+    InstanceSample,
     Proposal,
-    Seen,
     Trend,
     bounded,
     decide,
@@ -46,7 +46,7 @@ class Played:
     """Between two readings of processor time."""
     now: float = 1000.0
     cpu_s: float = 0.0
-    told: Seen = field(default_factory=Seen)
+    told: InstanceSample = field(default_factory=InstanceSample)
     trend: Trend | None = None
     changes: list[tuple[float, Proposal]] = field(default_factory=list)
 
@@ -56,7 +56,7 @@ class Played:
             self.now += 1.0
             self.cpu_s += min(cores, max(1.0, self.size.cpu))
             if self.now % self.every_s == 0:
-                self.told = Seen(self.cpu_s, int(mib * 2**20), step_s)
+                self.told = InstanceSample(self.cpu_s, int(mib * 2**20), step_s)
             self.trend, proposed = decide(self.scaling, self.size, self.trend, self.told, self.now)
             if proposed is not None:
                 self.changes.append((self.now, proposed))
@@ -175,19 +175,19 @@ def test_readings_that_come_every_fifteen_seconds_are_not_taken_for_bursts() -> 
 
 def test_another_run_counts_from_zero_and_a_change_by_hand_rests() -> None:
     played = Played(CPU).run(30, cores=0.5)
-    _, proposed = decide(CPU, played.size, played.trend, Seen(0.0, attempt=2), played.now + 1)
+    _, proposed = decide(CPU, played.size, played.trend, InstanceSample(0.0, attempt=2), played.now + 1)
     assert proposed is None
     by_hand = Size(cpu=0.5, memory_mb=256)
     trend = played.trend
     for second in range(1, int(PAUSE_S)):
-        trend, proposed = decide(CPU, by_hand, trend, Seen(played.cpu_s + second), played.now + second)
+        trend, proposed = decide(CPU, by_hand, trend, InstanceSample(played.cpu_s + second), played.now + second)
         assert proposed is None
 
 
 def test_nothing_is_decided_by_what_is_not_known() -> None:
     trend = None
     for second in range(600):
-        trend, proposed = decide(CPU, Size(cpu=4, memory_mb=256), trend, Seen(), float(second))
+        trend, proposed = decide(CPU, Size(cpu=4, memory_mb=256), trend, InstanceSample(), float(second))
         assert proposed is None
 
 

@@ -22,7 +22,7 @@ from ..telemetry.metrics import Metrics
 from .placer import Placer
 from .site import Site
 from .successors import Successors
-from .vertical_scaling import Proposal, Seen, Trend, bounded, decide, more_memory
+from .vertical_scaling import InstanceSample, Proposal, Trend, bounded, decide, more_memory
 
 log = logging.getLogger(__name__)
 
@@ -188,7 +188,7 @@ class Resizing:
         scaling, has = record.spec.needs.scaling, record.has
         if scaling is None:
             return
-        what = Seen(seen.cpu_s, seen.memory_bytes, seen.step_s, record.attempt)
+        what = InstanceSample(seen.cpu_s, seen.memory_bytes, seen.step_s, record.attempt)
         known.trend, proposed = decide(scaling, has, known.trend, what, self._steady())
         if proposed is None or self._steady() < known.not_before:
             return

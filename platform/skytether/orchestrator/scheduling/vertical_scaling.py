@@ -49,7 +49,7 @@ ROOM_MB = 32
 """Memory [MiB] that is left beside what is used, however little that is."""
 
 
-class Seen(NamedTuple):
+class InstanceSample(NamedTuple):
     """An instance as it was seen at one moment; None: not known."""
 
     cpu_s: float | None = None
@@ -102,7 +102,9 @@ class Proposal(NamedTuple):
     """Continues "... instead of ...:"."""
 
 
-def decide(scaling: Scaling, size: Size, trend: Trend | None, seen: Seen, now: float) -> tuple[Trend, Proposal | None]:
+def decide(
+    scaling: Scaling, size: Size, trend: Trend | None, seen: InstanceSample, now: float
+) -> tuple[Trend, Proposal | None]:
     """Whether an instance should have another size.
 
     Args:
@@ -196,7 +198,7 @@ def bounded(wanted: Size, has: Size, room: Size) -> Size:
     return Size(cpu=round(cpu, 3), memory_mb=memory)
 
 
-def _taken_up(trend: Trend | None, size: Size, seen: Seen, now: float) -> Trend:
+def _taken_up(trend: Trend | None, size: Size, seen: InstanceSample, now: float) -> Trend:
     if trend is None:
         return Trend(size, seen.attempt)
     if seen.attempt != trend.attempt:  # another run, which counts from zero
@@ -213,7 +215,7 @@ def _taken_up(trend: Trend | None, size: Size, seen: Seen, now: float) -> Trend:
     return replace(trend, size=size, cpu=cpu, memory=memory)
 
 
-def _cores(trend: Trend, seen: Seen, now: float) -> tuple[float | None, Trend]:
+def _cores(trend: Trend, seen: InstanceSample, now: float) -> tuple[float | None, Trend]:
     """How many were busy of late; None: not known yet."""
     if seen.cpu_s is None:
         return None, trend
