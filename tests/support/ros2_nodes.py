@@ -13,12 +13,13 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 
 from skytether.lab.netns import Namespace
 
+_T = TypeVar("_T")
 LIMIT_S = 30.0
 """Patience; discovery takes up to 3 s, on a machine that others use too longer."""
 
@@ -35,7 +36,7 @@ def qos(reliable=True, latched=False, depth=10):
     )
 
 def say(what):
-    print(json.dumps(what), flush=True)
+    print(json.dumps(what) + "\\n", end="", flush=True)  # in one, for threads may say something, too
 
 rclpy.init()
 node = rclpy.create_node(NAME, namespace=NAMESPACE)
@@ -180,3 +181,15 @@ def until(condition: Callable[[], object], what: str = "it", limit_s: float = LI
         if time.monotonic() > deadline:
             raise AssertionError(f"waited {limit_s:g} s for {what}")
         time.sleep(0.01)
+
+
+def steady(read: Callable[[], _T], for_s: float = 0.5, limit_s: float = LIMIT_S) -> _T:
+    """Wait until something is the same for so long; returns it."""
+    now = time.monotonic()
+    deadline, since, value = now + limit_s, now, read()
+    while time.monotonic() - since < for_s:
+        assert time.monotonic() < deadline, f"still changing after {limit_s:g} s: {value}"
+        time.sleep(0.05)
+        if (new := read()) != value:
+            since, value = time.monotonic(), new
+    return value

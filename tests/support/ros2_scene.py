@@ -35,10 +35,12 @@ class Scene:
 
     Attributes:
         link: The two networks.
+        diaries: A folder that services may write into.
     """
 
     def __init__(self, link: TunEmulator, orchestrator: EmbeddedOrchestrator, folder: Path) -> None:
         self.link, self.folder = link, folder
+        self.diaries = folder / "diaries"
         self._orchestrator = orchestrator
         self._robots: list[Agent] = []
         self.url = orchestrator.url.replace("127.0.0.1", SERVICE)
@@ -147,6 +149,12 @@ class Agent:
         return {t["topic"]: t["messages"]["published"] + t["graph"]["dropped"] for t in topics}
 
     @property
+    def told(self) -> int:
+        """Velocities that were published in the robot's graph."""
+        (wheels,) = [t["graph"]["passed"] for t in self.status["topics"] if t["topic"] == "cmd_vel"]
+        return int(wheels)
+
+    @property
     def settled(self) -> bool:
         """What became of every message that either end sent is known."""
         counts = self.counts
@@ -191,7 +199,16 @@ def scene_over_a_bad_link(folder: Path, domain: int) -> Iterator[Scene]:
         made = Scene(link, orchestrator, folder)
         try:
             paths = [str(ROOT / part) for part in ("platform", "services", "docs/examples")]
-            options = {"bind_host": SERVICE, "python_path": paths}
+            made.diaries.mkdir()
+            made.diaries.chmod(0o777)  # a service is another user
+            python = os.environ["SKYTETHER_ROS2_PYTHON"]
+            options = {
+                "bind_host": SERVICE,
+                "python_path": paths,
+                "environment": {"SKYTETHER_ROS2_PYTHON": python},
+                "readable": [str(Path(python).parents[1])],
+                "writable": [str(made.diaries)],
+            }
             site = SiteCreate(name="edge", tier="edge", runtime="process", options=options)
             made.ask(lambda client: client.create_site(site))
             yield made

@@ -1,11 +1,16 @@
-"""The main job on real ROS 2: a walker that is nodes of rclpy is guided by ``virtual-trail`` across a bad network."""
+"""The main job on real ROS 2: a walker that is nodes of rclpy is guided across a bad network by nodes of rclpy.
+
+Nobody has changed the nodes at either end: the service is a graph of its own (``graph: ros2``), in its own network and
+domain. Both ends' nodes keep diaries, so that what the bridge says it delivered is held against what they heard.
+"""
+
+import time
 
 import psutil
 import pytest
-import yaml
-from ros2_nodes import ros2_nodes, until
+from ros2_nodes import ros2_nodes, steady, until
 from ros2_scene import ROOT, scene_over_a_bad_link
-from ros2_walker import Ros2Walker
+from ros2_walker import Diary, Ros2Walker
 
 from skytether.api.manifest import Manifest
 from skytether.lab.trail import THESIS_TRAIL
@@ -13,57 +18,136 @@ from skytether.lab.trail import THESIS_TRAIL
 __all__ = ["ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2, pytest.mark.usefixtures("netns")]
 
-SERVICE = "virtual-trail"
 WALK_S = 180.0
+SENSORS = {"force": "geometry_msgs/msg/WrenchStamped", "wheels": "sensor_msgs/msg/JointState"}
+SENSORS |= {"odom": "nav_msgs/msg/Odometry"}
+
+
+def trail_service():
+    """Its nodes are a program; each message is to be heard, so rows keep more than the newest."""
+    common = {"direction": "in", "period_ms": 10, "lifespan_ms": 50, "delivery": 0.999, "depth": 100}
+    topics = [{"name": name, "type": kind, **common} for name, kind in SENSORS.items()]
+    velocity = {"period_ms": 20, "lifespan_ms": 100, "delivery": 0.9999, "priority": 127, "depth": 100}
+    topics.append({"name": "cmd_vel", "type": "geometry_msgs/msg/Twist", "direction": "out", **velocity})
+    numbers = {"type": "array", "items": {"type": "number"}}
+    spec = {
+        "graph": "ros2",
+        "launch": str(ROOT / "tests" / "support" / "ros2_trail.py"),
+        "topics": topics,
+        "remap": {topic["name"]: f"/{topic['name']}" for topic in topics},
+        "params": {"properties": {"lengths": numbers, "curvatures": numbers, "diary": {"type": "string"}}},
+        "needs": {"cpu": 0.1, "memory_mb": 256},
+    }
+    document = {"apiVersion": "skytether.io/v1", "kind": "Service", "metadata": {"name": "trail"}, "spec": spec}
+    return Manifest.model_validate(document)
+
+
+def pieces(trail):
+    """Lengths and curvatures."""
+    lengths = [p.get("length") or p["radius"] * abs(p["angle"]) for p in trail]
+    curvatures = [0.0 if "length" in p else (1 if p["angle"] > 0 else -1) / p["radius"] for p in trail]
+    return {"lengths": lengths, "curvatures": curvatures}
 
 
 @pytest.fixture
 def scene(ros2_nodes, tmp_path):
     with scene_over_a_bad_link(tmp_path, ros2_nodes.domain) as made:
+        made.ask(lambda client: client.put_service("trail", trail_service()))
         yield made
 
 
-@pytest.fixture
-def make_walker(scene, ros2_nodes):
-    """A walker and its agent, driven by the service; the person walks."""
+class Walk:
+    """A walker, its agent, and the diary of the service's nodes."""
 
-    def make(trail):
-        agent = scene.robot("walker", SERVICE, params={"trail": list(trail)})
-        walker = Ros2Walker(ros2_nodes, "/walker", scene.link.robot, trail)
-        agent.start()
-        until(lambda: agent.status["link"]["connected"], "a session")
-        walker.wait_until_joined()
-        walker.begin()
-        until(lambda: agent.drives, "the service to drive")
-        walker.walk()
-        return agent, walker
+    def __init__(self, scene, nodes, name, trail):
+        self.service = Diary(scene.diaries / f"{name}-trail")
+        params = {**pieces(trail), "diary": str(self.service.path)}
+        self.agent = scene.robot(name, "trail", params=params)
+        self.walker = Ros2Walker(nodes, name, scene.link.robot, trail, scene.diaries)
+        self.agent.start()
 
-    return make
+    def begin(self):
+        """The service drives; the person stands."""
+        self.walker.wait_until_joined()
+        until(lambda: self.service.read("joined"), "the service's nodes")
+        # The agent's first standstills, from before its node and the wheels have found each other.
+        self.unheard = steady(lambda: self.agent.told - len(self.walker.told()))
+        self.walker.begin()
+        until(lambda: self.agent.drives, "the service to drive")
+
+    def finish(self):
+        """To the end of the trail, and until all that was under way has come."""
+        until(lambda: self.walker.look() and self.walker.judge.completed, "the end of the trail", WALK_S)
+        self.walker.park()
+        steady(lambda: (self.agent.told, self.agent.counts))
+        until(lambda: self.agent.settled, "both ends to agree on what became of every message")
+
+    def goes_on(self, way=0.4):
+        """It is guided on for so far [m]."""
+        goal = self.walker.judge.s + way
+        until(lambda: self.walker.look() > goal and self.agent.drives, "the walk to go on", WALK_S)
+
+    def stood(self):
+        """Wait until the wheels are told to stand; returns when that was [ns]."""
+        until(lambda: not self.agent.drives, "the loss to be seen")
+        until(lambda: self.walker.stands, "the robot to stand")
+        return self.walker.told()[-1][0]
+
+    def assert_stood(self, since, until_ns):
+        """All that the wheels were told between two times [ns] is to stand."""
+        assert since < until_ns
+        assert {(x, z) for at, x, z in self.walker.told() if since < at < until_ns} <= {(0.0, 0.0)}
+
+    def assert_all_delivered_was_heard(self):
+        """Whatever the bridge says it delivered, one by one; nothing that both ends were there for is missing."""
+        counts = self.agent.counts
+        for topic in SENSORS:
+            published, heard = self.walker.diary.stamps(topic), self.service.stamps(topic)
+            assert len(set(heard)) == len(heard), topic
+            assert set(heard) <= set(published), topic
+            assert len(heard) == counts[topic]["delivered"], topic
+        said = [tuple(line) for line in self.service.read("cmd_vel")]
+        assert counts["cmd_vel"]["offered"] == len(said)
+        # The control loop had them all, and the wheels all that it wanted.
+        status = self.agent.status
+        assert status["commands"] + status["missed_commands"] == counts["cmd_vel"]["delivered"]
+        assert self.agent.told - len(self.walker.told()) == self.unheard
+        assert_follow(self.walker.told(), said)
 
 
-def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, make_walker):
-    agent, walker = make_walker(THESIS_TRAIL)
-    until(lambda: walker.look() and walker.judge.completed, "the end of the trail", WALK_S)
-    published = walker.park()
-    until(lambda: agent.settled, "both ends to agree on what became of every message")
-    until(lambda: agent.taken == published, "every message of the walker's nodes to be accounted for")
-    result, counts = walker.result(), agent.counts
-    assert result.kte_m < 0.05, agent.log
-    assert result.deviation_max_m < 0.15
+def assert_follow(told, said):
+    """What wheels were told is what was said, in its order; but for ramps, and where a newer one came within a tick."""
+    at, heard = 0, set()
+    for _, *velocity in told:
+        if any(velocity) and tuple(velocity) in said:  # a standstill may be the supervisor's
+            at = said.index(tuple(velocity), at)
+            heard.add(at)
+    assert len(heard) > 100
+
+
+def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, ros2_nodes):
+    walk = Walk(scene, ros2_nodes, "walker", THESIS_TRAIL)
+    walk.begin()
+    walk.walker.walk()
+    walk.finish()
+    counts, result = walk.agent.counts, walk.walker.result()
+    assert result.kte_m < 0.1, walk.agent.log  # 16 mm; more on a machine that has no time for the commands
+    assert result.deviation_max_m < 0.3
     assert sum(c.lost for c in scene.link.counters().values()) > 50
-    assert set(counts) == {"force", "wheels", "odom", "cmd_vel"}
+    assert set(counts) == {*SENSORS, "cmd_vel"}
     for topic, outcomes in counts.items():
         assert outcomes["lost"] - outcomes["late"] <= 0.001 * outcomes["sent"], topic
         assert outcomes["unknown"] == 0, topic
-    for topic, messages in published.items():
-        # What is newest by the time that it is its turn goes on: on a busy machine not each.
-        assert 0.9 * messages < counts[topic]["sent"] <= messages, topic
-    assert walker.heard > 3000
+    for topic in SENSORS:
+        published = len(walk.walker.diary.stamps(topic))
+        assert 0.98 * published <= walk.agent.taken[topic] <= published, topic
+    walk.assert_all_delivered_was_heard()
 
 
-def killed(process):
-    process.kill()
-    psutil.wait_procs([process])
+def killed(*processes):
+    for process in processes:
+        process.kill()
+    psutil.wait_procs(processes)
 
 
 def program_of(agent):
@@ -72,83 +156,51 @@ def program_of(agent):
     return found
 
 
-def test_each_part_is_killed_in_mid_trail_and_the_walk_is_finished(scene, make_walker):
-    """The sensors' node, the service, the agent, its program; the wheels stand meanwhile, and go on where they were."""
-    agent, walker = make_walker([{"length": 3.5}])
+def test_each_part_of_one_robot_is_killed_beside_another_and_both_walks_are_finished(scene, ros2_nodes):
+    """The agent, the service, the sensors' node, the agent's program; the wheels stand meanwhile, and go on there.
 
-    def goes_on(way):
-        goal = walker.judge.s + way
-        until(lambda: walker.look() > goal and agent.drives, "the walk to go on", WALK_S)
+    The other robot of the domain, with a service of its own, does not notice.
+    """
+    walk, other = (Walk(scene, ros2_nodes, name, [{"length": 3.5}]) for name in ("anna", "ben"))
+    agent, walker = walk.agent, walk.walker
+    for each in (walk, other):
+        each.begin()
+    for each in (walk, other):
+        each.walker.walk()
 
-    goes_on(0.4)
-    walker.lose_forearms()
-    until(lambda: not agent.drives, "the loss of the sensors to be seen")
-    walker.start_forearms()
-    goes_on(0.4)
-    instance = agent.status["instance"]["id"]
-    (service,) = scene.processes_of(instance)
-    killed(service)
-    until(lambda: not agent.drives, "the loss of the service to be seen")
-    goes_on(0.4)
-    assert scene.ask(lambda client: client.get_instance(instance)).restarts == 1
+    walk.goes_on()
     agent.kill()
+    stood = walk.stood()
+    back = time.time_ns()
     agent.start()
-    goes_on(0.4)
+    walk.goes_on()
+    walk.assert_stood(stood, back)
+    instance = agent.status["instance"]["id"]
+
+    killed(*scene.processes_of(instance))
+    stood = walk.stood()
+    walk.goes_on()
+    walk.assert_stood(stood, walk.service.read("began")[-1][0])
+    assert scene.ask(lambda client: client.get_instance(instance)).restarts == 1
+
+    walker.lose_sensors()
+    stood = walk.stood()
+    back = time.time_ns()
+    walker.start_sensors()
+    walk.goes_on()
+    walk.assert_stood(stood, back)
+
     program = program_of(agent)
     killed(program)
-    goes_on(0.4)
+    walk.goes_on()
     assert program_of(agent).pid != program.pid
-    until(lambda: walker.look() and walker.judge.completed, "the end of the trail", WALK_S)
-    walker.park()
-    until(lambda: agent.settled, "both ends to agree on what became of every message")
-    assert walker.result().kte_m < 0.05, agent.log
 
-
-BASE = """
-from geometry_msgs.msg import Twist
-from sensor_msgs.msg import LaserScan
-
-node.create_subscription(Twist, "cmd_vel", lambda m: say(m.linear.x), 10)
-scans = node.create_publisher(LaserScan, "scan", qos(reliable=False, depth=5))
-def scan():
-    made = LaserScan(angle_min=-1.0, angle_increment=0.01, range_max=10.0, ranges=[3.0] * 200)
-    made.header.stamp = node.get_clock().now().to_msg()
-    scans.publish(made)
-node.create_timer(0.05, scan)
-"""
-
-
-def test_two_robots_in_one_domain_have_nothing_to_do_with_each_other(scene, ros2_nodes):
-    manifest = yaml.safe_load((ROOT / "docs" / "examples" / "wall_stop" / "service.yaml").read_text())
-    manifest["spec"]["needs"] = {"cpu": 0.1}  # how well a busy machine keeps time is not what is asked here
-    scene.ask(lambda client: client.put_service("wall-stop", Manifest.model_validate(manifest)))
-    speeds = {"anna": 0.2, "ben": 0.1}
-    bases = {name: ros2_nodes.start(BASE, "base", f"/{name}", scene.link.robot) for name in speeds}
-    agents = {name: scene.robot(name, "wall-stop", params={"speed": speed}) for name, speed in speeds.items()}
-    told = {name: [] for name in speeds}
-
-    def drives(name):
-        told[name] += new if (new := bases[name].all()) else []
-        return bool(new) and abs(new[-1] - speeds[name]) < 1e-9
-
-    for agent in agents.values():
-        agent.start()
-    for name in speeds:
-        until(lambda name=name: drives(name), f"{name} to be driven")
-    of_ben = agents["ben"].status["instance"]["id"]
-    agents["anna"].kill()
-    until(lambda: bases["anna"].next() == 0.0, "the standstill of the robot whose agent was killed")
-    agents["anna"].start()
-    until(lambda: drives("anna"), "it to be driven again")
-    bases["anna"].close()
-    until(lambda: not agents["anna"].drives, "the loss of its base to be seen")
-    until(lambda: drives("ben"), "the other one to be driven all the same")
-    assert agents["ben"].status["instance"]["id"] == of_ben
-    assert agents["ben"].log.rindex("no session") < agents["ben"].log.index("session up"), (
-        "it has one session, all along"
-    )
-    assert max(told["anna"]) <= 0.2 + 1e-9
-    assert max(told["ben"]) <= 0.1 + 1e-9
-    said = agents["anna"].log + agents["ben"].log
-    assert "another node of this ROS 2 graph" not in said
-    assert "publishes /" not in said
+    walk.finish()
+    other.finish()
+    other.assert_all_delivered_was_heard()
+    assert max(other.walker.result().kte_m, walker.result().kte_m) < 0.1, agent.log
+    for topic in SENSORS:
+        published, heard = walker.diary.stamps(topic), walk.service.stamps(topic)
+        assert len(set(heard)) == len(heard), topic
+        assert set(heard) <= set(published), topic
+    assert "another node of this ROS 2 graph" not in agent.log + other.agent.log
