@@ -210,6 +210,8 @@ def test_unchanged_nodes_in_containers_drive_robots_hang_crash_and_end(
     until(lambda: all(one.state.final for one in client.instances()), "the instances to end")
     assert {one.state for one in client.instances()} == {"stopped"}
     until(lambda: "goodbye" in "".join(client.logs(one.id) for one in client.instances()), "the node to end in order")
+    logs = "".join(client.logs(one.id) for one in client.instances())
+    assert "Traceback" not in logs + said
 
 
 END_GUIDE = """

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
@@ -51,7 +52,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
-        self._patience_s = timing.guard_s
+        self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._publication = self._node.publish(
             endpoint, farewell=farewell, farewell_after_s=timing.brakes_s, fresh_s=timing.fresh_s
         )

@@ -22,6 +22,10 @@ class Ros2Config(Ros2Graph, Ros2Velocity, RobotSection):
 class Ros2Way(Ros2Link, Ros2Velocity, GateSection):
     """A robot that is a ROS 2 graph. Its nodes are called ``node`` with ``_guard``, ``_gate``, ``_sensors`` after."""
 
+    need_acknowledgements: bool = True
+    """Whether the wheels are braked while somebody who listens reliably to the velocities does not acknowledge them;
+    false where others listen over a network that is too bad for that. Of ``rclpy``."""
+
     @field_validator("namespace", "cmd_vel")
     @classmethod
     def _a_name(cls, name: str) -> str:
