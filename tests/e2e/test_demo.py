@@ -17,11 +17,11 @@ from skytether.api.client import Client
 from skytether.lab.demo import ROBOT, Demo, DemoSettings
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 pytestmark = pytest.mark.slow
 
-LOCAL_WITHIN_S = Limits().silence_s + 0.1
+LOCAL_WITHIN_S = VelocityLimits().silence_s + 0.1
 """What may be learned to wait for on a busy machine, and some turns of the control loop that come late there."""
 
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from skytether.control.admittance import Velocity
 from skytether.lab.safety.checker import Demand, Told, Wheels, check, tightest
 from skytether.lab.safety.socket_hardware import steady
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 PERIOD = 0.02
-LIMITS = Limits(linear_max=0.5, linear_min=-0.1, angular_max=0.8)  # 1 and 2 m/s^2, 2 and 4 rad/s^2
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.1, angular_max=0.8)  # 1 and 2 m/s^2, 2 and 4 rad/s^2
 WHEELS = Wheels(LIMITS, silence_s=0.1, jitter_s=PERIOD)
 
 

@@ -12,7 +12,7 @@ from skytether.messages import Twist, Vector3, encode
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.session.session import LiveSession
 from skytether.wire.events import Connected, Disconnected, MessageReceived
 from skytether_services.virtual_trail.fallback import HoldTrail
@@ -26,7 +26,7 @@ class Walk:
     def __init__(self, **options):
         self.base = WalkerHardware(World(Trail(), seed=1))
         self.base.walking.set()
-        self.driver = ControlLoop(self.base, HoldTrail(**options), Limits(), Needs(), 100.0)
+        self.driver = ControlLoop(self.base, HoldTrail(**options), VelocityLimits(), Needs(), 100.0)
         self.base.source = lambda: self.driver.source
         self.ticks = count(1)
         self.told = []
@@ -65,7 +65,9 @@ def test_it_goes_on_where_the_service_left_without_a_jump():
     walk.run(3.0)
     assert walk.driver.source is Source.FALLBACK
     around = walk.told[395:450]
-    assert max(abs(b.linear - a.linear) for a, b in pairwise(around)) <= Limits().linear_acceleration * TICK + 1e-9
+    assert (
+        max(abs(b.linear - a.linear) for a, b in pairwise(around)) <= VelocityLimits().linear_acceleration * TICK + 1e-9
+    )
     assert min(v.linear for v in around) > 0.1, "the person is not held up"
     assert abs(Trail().locate(walk.base.world.pose.x, walk.base.world.pose.y).offset) < 0.05
 

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.messages import Header, Message, Point32, PointCloud, Range
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from .follow_in_front_report import IMAGE, LASER, POSE, SCAN, SONAR
 from .follow_in_front_result import FollowResult, FollowTraces
@@ -35,7 +35,7 @@ from .world.sensors import sonar_radius
 from .world.simulation import CAMERA, REAR_SCAN, Readings, Simulation
 
 ROBOT, SERVICE = "pioneer", "follow-in-front"
-LIMITS = Limits(linear_max=0.8, angular_max=1.0, max_gap_s=0.3)
+LIMITS = VelocityLimits(linear_max=0.8, angular_max=1.0, max_gap_s=0.3)
 """What the simulated robot can do. Commands come each 100 ms: one that is lost on the way must not stop it."""
 NAMES: Mapping[str, str] = MappingProxyType({"odom": POSE, "scan": LASER, REAR_SCAN: SCAN, CAMERA: IMAGE})
 """Topics as the drivers of the thesis's robot name them (Table 2); its sonars are all in one message."""

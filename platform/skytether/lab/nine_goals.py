@@ -16,7 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 from skytether.messages import Path, decode
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from .nine_goals_result import NineGoalsResult, NineGoalsTraces
 from .trial.results import Measured, Point, rounded
@@ -30,7 +30,7 @@ from .world.simulation import Simulation
 ROBOT, SERVICE = "pioneer", "navigation"
 _BEAT_S = 2.0
 """The map is given again so long after a service said that it has none."""
-LIMITS = Limits(linear_max=0.5, linear_min=-0.1, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.1, angular_max=1.0)
 """What the simulated robot can do."""
 
 _EMBEDDED_RATES = {

@@ -11,7 +11,7 @@ from skytether.messages import LaserScan, String, Twist, Vector3, decode, encode
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Stop
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.wire.events import MessageReceived
 
 MOVE = Twist(Vector3(x=0.4))
@@ -53,7 +53,7 @@ def test_an_unknown_topic_name_is_refused() -> None:
 
 def test_the_robots_control_loop_runs_on_it() -> None:
     base = WorldHardware(Clockwork(Simulation(building(), seed=1)))
-    driver = ControlLoop(base, Stop(), Limits(), Needs(), 0.0)
+    driver = ControlLoop(base, Stop(), VelocityLimits(), Needs(), 0.0)
     for tick in range(24):
         driver.tick(tick * TICK)
     status = driver.status()

@@ -15,7 +15,7 @@ from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance, Stop
 from skytether.robot.control.service_manager import Terms, terms
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.control.wheels_feedback import WheelsFeedback
 from skytether.robot.session.link_quality import Quality
 from skytether.robot.session.session import LiveSession
@@ -37,7 +37,9 @@ class Rig:
     def __init__(self, base, cloud, fallback=None, observer=None, limits=None):
         self.base = base
         self.now = 100.0
-        self.driver = ControlLoop(base, fallback or Admittance(), limits or Limits(), Needs(), self.now, observer)
+        self.driver = ControlLoop(
+            base, fallback or Admittance(), limits or VelocityLimits(), Needs(), self.now, observer
+        )
         self._make_cloud = cloud
         self.epochs = count(1)
         """Numbers of handshakes, of all sessions."""
@@ -136,7 +138,7 @@ def test_silence_hands_over_to_the_person_within_300_ms_without_a_jump_and_back(
         "control: cloud -> fallback (no_command): no command for 1x0 ms, 150 ms at most",
         "control: fallback -> cloud (recovered): all has been well for 1 s",
     ]
-    limits = Limits()
+    limits = VelocityLimits()
     for (v0, w0), (v1, w1) in pairwise(driven.base.written):
         assert abs(v1 - v0) <= limits.linear_acceleration * TICK + 1e-9, "no braking in between, no jump"
         assert abs(w1 - w0) <= limits.angular_acceleration * TICK + 1e-9
@@ -341,7 +343,7 @@ def test_each_trouble_is_named_once_not_at_every_tick(driven, nan_twist, caplog)
 
 @pytest.mark.parametrize(("period", "patience"), [(0.02, 0.07), (0.05, 0.125), (0.1, 0.25)])
 def test_a_service_is_left_within_three_of_its_periods(base, make_cloud, bridge, period, patience):
-    rig = Rig(base, make_cloud, limits=Limits(max_gap_s=1.0))
+    rig = Rig(base, make_cloud, limits=VelocityLimits(max_gap_s=1.0))
     rig.connect(bridge)
     rig.driver.hold_to(Terms(period_s=period))
     for _ in range(round(8 / period)):
@@ -494,8 +496,8 @@ def test_the_fallback_is_told_no_time_that_cannot_be(base, make_cloud):
     rig = Rig(base, make_cloud, fallback=Asked())
     for now in (100.01, 100.1, 101.0, 90.0, nan, 90.01):
         rig.driver.tick(now)
-    assert told[:4] == [pytest.approx(0.01), Limits().max_step_s, pytest.approx(0.01), 0.0]
-    assert all(0.0 <= dt <= Limits().max_step_s for dt in told)
+    assert told[:4] == [pytest.approx(0.01), VelocityLimits().max_step_s, pytest.approx(0.01), 0.0]
+    assert all(0.0 <= dt <= VelocityLimits().max_step_s for dt in told)
 
 
 def test_a_session_that_was_closed_is_not_connected(driven):

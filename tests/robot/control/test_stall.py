@@ -11,11 +11,11 @@ from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance
 from skytether.robot.control.stall import StallWatch
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.session.session import LiveSession
 
 TICK = 0.01
-LIMITS = Limits()
+LIMITS = VelocityLimits()
 STEP = LIMITS.linear_acceleration * TICK
 
 

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from skytether.control.admittance import Velocity
 from skytether.robot.control.command import Command, Source
-from skytether.robot.control.supervisor import Limits, Objection, Supervised, admit, max_age, step
+from skytether.robot.control.supervisor import Objection, Supervised, VelocityLimits, admit, max_age, step
 
-LIMITS = Limits()
+LIMITS = VelocityLimits()
 MAX_AGE = 0.75
 HALF = Command(Source.CLOUD, 0.125, 0.25, epoch=1, sequence=0, sent_at=-0.05, sent_at_error=0.05, received_at=0.0)
 
@@ -149,7 +149,7 @@ def test_age_is_judged_by_what_the_service_needs():
 )
 def test_limits_that_do_not_limit_are_refused(field, value):
     with pytest.raises(ValueError, match="limits: "):
-        Limits(**{field: value})
+        VelocityLimits(**{field: value})
 
 
 events = st.lists(

@@ -8,11 +8,11 @@ from skytether.control.admittance import Velocity
 from skytether.robot.control.arbiter import Needs
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.control.wheels_feedback import WheelsFeedback
 
 TICK = 0.01
-LIMITS = Limits()
+LIMITS = VelocityLimits()
 STEP = LIMITS.linear_acceleration * TICK
 
 

@@ -10,14 +10,14 @@ from skytether.guard.protocol import STOP_SOCKET
 from skytether.guard.requests import Requests
 from skytether.messages import Joy, Twist, Vector3
 from skytether.robot.agent.gated_hardware import GatedHardware
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.client import GateLink, stop
 from skytether.robot.safety.geometry import kinematics
 from skytether.robot.safety.rules import estop, joystick
 from skytether.robot.safety.rules.estop import ButtonParams, Estop
 from skytether.robot.safety.rules.joystick import Grip, Joystick, JoystickParams
 
-LIMITS = Limits()  # accelerates 1 m/s^2 and 2 rad/s^2, brakes 2 m/s^2 and 4 rad/s^2
+LIMITS = VelocityLimits()  # accelerates 1 m/s^2 and 2 rad/s^2, brakes 2 m/s^2 and 4 rad/s^2
 PAD = JoystickParams(deadman=1, linear_axis=1, angular_axis=0, linear=0.2, angular=0.4, deadzone=0.0, max_age_s=0.3)
 RELEASED = Joystick(seen_released=True)
 

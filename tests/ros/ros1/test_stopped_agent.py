@@ -7,7 +7,7 @@ import pytest
 from ros1_graph import wait_for
 
 from skytether.messages import Twist, decode, type_hash
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.ros.ros1.subscription import Listener
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
@@ -22,7 +22,7 @@ def test_an_agent_that_was_stopped_goes_on_from_standstill(graph, config, walker
     listener = Listener(lambda data, _: told.append((time.monotonic(), decode(Twist, data, "ros1").linear.x)))
     walker.node.subscribe("/cmd_vel", "geometry_msgs/Twist", type_hash(Twist, "ros1"), listener)
     process = graph.skytether("robot", "run", str(config))
-    limits = Limits()
+    limits = VelocityLimits()
     for stopped in (2.0, 0.5, 2.0):
         wait_for(lambda: told and told[-1][1] > 0.15, "the service to drive")
         process.send_signal(signal.SIGSTOP)

@@ -36,7 +36,7 @@ from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Command, Source
 from skytether.robot.control.failure_detector import least_s
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.wire.topic import Role
 
 from .pair import BenchError
@@ -204,7 +204,7 @@ def bench_config(rate: float) -> AgentConfig:
         token="",
         service="bench",
         fallback="admittance",
-        limits=Limits(max_gap_s=most_s(rate)),
+        limits=VelocityLimits(max_gap_s=most_s(rate)),
         bind=("127.0.0.1", 0),
     )
 

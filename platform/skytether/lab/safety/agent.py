@@ -18,7 +18,7 @@ from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.client import GateLink
 
 from .robot import LIMITS
@@ -52,7 +52,7 @@ def main() -> None:
         service="virtual-trail",
         fallback="admittance",
         fallback_options={"max_linear": abs(linear), "max_angular": max(0.1, abs(angular))},
-        limits=Limits(**LIMITS),
+        limits=VelocityLimits(**LIMITS),
     )
     with Agent(config, GatedHardware(_Pushed(linear, angular), GateLink(folder))):
         while True:

@@ -20,7 +20,7 @@ from math import inf, isfinite
 from typing import NamedTuple
 
 from skytether.guard.velocity import STANDSTILL, Velocity
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 _STRETCH_S = 0.5
 """Longest stretch over which a change of velocity is looked at: from full speed to standstill and more."""
@@ -78,7 +78,7 @@ class Wheels:
         jitter_s: How well the time of a message is known, and the time between two.
     """
 
-    limits: Limits
+    limits: VelocityLimits
     silence_s: float
     jitter_s: float
 

@@ -23,7 +23,7 @@ from skytether.messages import Message, Twist, Vector3, encode
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
 from skytether.robot.agent.gated_hardware import GatedHardware
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.client import GateLink
 from skytether.wire.topic import Role
 
@@ -66,7 +66,7 @@ def main() -> None:
     )
     spec = SessionSpec.from_api(Role.SERVICE, session.id, session.key or "", session.topics)
     config = AgentConfig(
-        robot="bench", url="", token="", service="bench", limits=Limits(**LIMITS), bind=("127.0.0.1", 0)
+        robot="bench", url="", token="", service="bench", limits=VelocityLimits(**LIMITS), bind=("127.0.0.1", 0)
     )
     with Bridge(spec, GraphPort(LocalGraph(), spec.topics, Role.SERVICE)) as bridge:
         host, port = bridge.address[:2]

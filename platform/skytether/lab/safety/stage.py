@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from skytether.guard.clock import now
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.client import GateError
 from skytether.robot.safety.config.safety_config import SafetyConfig
 
@@ -48,7 +48,7 @@ class Promised:
     @classmethod
     def of(cls, config: SafetyConfig) -> Promised:
         """Those of a configuration: what it waits for, two turns, and braking from full speed."""
-        limits = config.limits or Limits()
+        limits = config.limits or VelocityLimits()
         period = 1 / config.rate_hz
         brakes = max(limits.linear_max / limits.linear_braking, limits.angular_max / limits.angular_braking)
         turns = _TURNS if config.graph is None else _TURNS + 1  # the writer's
@@ -72,7 +72,7 @@ def wheels_of(config: SafetyConfig) -> Wheels:
     On a graph two periods of tolerance: the time is that of the receipt, and the writer has turns of its own.
     """
     periods = 1 if config.graph is None else 2
-    return Wheels(config.limits or Limits(), silence_s=config.guard_s, jitter_s=periods / config.rate_hz)
+    return Wheels(config.limits or VelocityLimits(), silence_s=config.guard_s, jitter_s=periods / config.rate_hz)
 
 
 class Stage:

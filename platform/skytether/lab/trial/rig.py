@@ -28,7 +28,7 @@ from skytether.lab.world.simulation import Simulation
 from skytether.messages import Message, String, Twist, decode
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from .results import Measured, TopicRow
 from .scenario import TrialSettings
@@ -58,7 +58,7 @@ class Task:
     service: str
     params: Mapping[str, Any]
     robot: str
-    limits: Limits
+    limits: VelocityLimits
     names: Mapping[str, str] | None = None
 
 

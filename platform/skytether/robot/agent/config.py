@@ -11,7 +11,7 @@ from skytether.api import rest
 from skytether.bridge.interfaces import Wanted
 
 from ..control.arbiter import Needs
-from ..control.supervisor import Limits
+from ..control.supervisor import VelocityLimits
 from ..offload.site_prober import TaskConfig
 
 Address = tuple[str, int]
@@ -60,7 +60,7 @@ class AgentConfig:
     measurements: Mapping[str, rest.Measurement] = field(default_factory=dict)
     fallback: str = "stop"
     fallback_options: Mapping[str, Any] = field(default_factory=dict)
-    limits: Limits = field(default_factory=Limits)
+    limits: VelocityLimits = field(default_factory=VelocityLimits)
     needs: Needs = field(default_factory=Needs)
     command_topic: str = "cmd_vel"
     rate_hz: float = 100.0

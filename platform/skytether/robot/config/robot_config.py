@@ -18,7 +18,7 @@ from skytether.bridge.local_network import LocalNetwork
 from skytether.robot.agent.status import DEFAULT_PORT
 from skytether.robot.config_base import no_switches
 from skytether.robot.control.arbiter import Needs
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.graphs.graph_base import protected_names as graph_names
 from skytether.robot.graphs.graph_config import RobotGraphConfig
 from skytether.robot.graphs.kind import GateSection, GraphKind, RobotSection
@@ -132,7 +132,7 @@ class RobotConfig(Strict):
     """The service's topic that drives the robot (geometry_msgs/msg/Twist)."""
     fallback: FallbackConfig = FallbackConfig()
     limits: dict[str, float] = {}
-    """What the wheels may do: fields of ``skytether.robot.control.supervisor.Limits``."""
+    """What the wheels may do: fields of ``skytether.robot.control.supervisor.VelocityLimits``."""
     beyond: dict[str, Annotated[str, Field(min_length=1, max_length=LONGEST_REASON)]] = {}
     """Limits that are meant to be beyond what is plausible: ``limits.NAME`` to reason."""
     needs: LinkNeeds = LinkNeeds()
@@ -179,14 +179,14 @@ class RobotConfig(Strict):
     @field_validator("limits")
     @classmethod
     def _they_limit(cls, limits: dict[str, float]) -> dict[str, float]:
-        known = [f.name for f in fields(Limits)]
+        known = [f.name for f in fields(VelocityLimits)]
         for name in limits:
             if name not in known:
                 near = difflib.get_close_matches(name, known, n=1)
                 guess = f", did you mean {near[0]!r}?" if near else ""
                 raise ValueError(f"{name}: unknown key{guess}; allowed are {', '.join(known)}")
         try:
-            Limits(**limits)
+            VelocityLimits(**limits)
         except ValueError as error:
             raise ValueError(str(error).removeprefix("limits: ")) from None
         return limits
@@ -261,7 +261,7 @@ class RobotConfig(Strict):
             remap=graph.remap,
             cmd_vel=graph.cmd_vel if self.safety is None else None,
             idle_s=graph.idle_s,
-            fresh_s=Limits(**self.limits).watchdog_s,
+            fresh_s=VelocityLimits(**self.limits).watchdog_s,
             readings=graph.readings,
             topics=graph.topics,
             allowed=self.allowed,

@@ -27,7 +27,7 @@ from .fallback import Fallback, Reading, Watching
 from .restart_interlock import RestartInterlock
 from .service_manager import Terms
 from .stall import StallWatch
-from .supervisor import Limits, Objection, Supervised
+from .supervisor import Objection, Supervised, VelocityLimits
 from .wheels_feedback import AsksWhy, TellsBack, WheelsFeedback, rebase
 
 _log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ class RobotHardware(Protocol):
     """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick.
 
     A call that never returns, or a killed process, ends the control loop: motors must stop by themselves when nothing
-    has been written for some 100 ms (`Limits.watchdog_s`), as motor drives with a watchdog do.
+    has been written for some 100 ms (`VelocityLimits.watchdog_s`), as motor drives with a watchdog do.
     """
 
     topics: Mapping[str, type[Message]]
@@ -115,7 +115,7 @@ class ControlStatus:
         readings: Messages read from the hardware, by topic.
         silence_limit_s: A longer silence of the cloud hands over, as was learned of its commands.
         told: What the gate told the wheels last; None: there is none, or it does not say.
-        stalls: Times that the loop stood still for longer than `Limits.watchdog_s`, or the computer slept.
+        stalls: Times that the loop stood still for longer than `VelocityLimits.watchdog_s`, or the computer slept.
     """
 
     source: Source
@@ -154,7 +154,7 @@ class ControlLoop:
         self,
         hardware: RobotHardware,
         fallback: Fallback,
-        limits: Limits,
+        limits: VelocityLimits,
         needs: Needs,
         now: float,
         observer: Observer | None = None,

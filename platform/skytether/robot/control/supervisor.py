@@ -57,7 +57,7 @@ _MOST_SILENCE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class VelocityLimits:
     """What the robot's wheels may do, whoever drives. The defaults are the walker's (thesis section 2.5.1).
 
     Attributes:
@@ -118,8 +118,8 @@ class Limits:
 
 
 @lru_cache(maxsize=64)
-def with_gap(limits: Limits, max_gap_s: float) -> Limits:
-    """The same limits with another `Limits.max_gap_s`; asked several times in each turn of a loop."""
+def with_gap(limits: VelocityLimits, max_gap_s: float) -> VelocityLimits:
+    """The same limits with another `VelocityLimits.max_gap_s`; asked several times in each turn of a loop."""
     return replace(limits, max_gap_s=max_gap_s)
 
 
@@ -141,7 +141,7 @@ class Supervised:
 
 
 def admit(
-    limits: Limits, state: Supervised, command: Command, max_age_s: float, now: float
+    limits: VelocityLimits, state: Supervised, command: Command, max_age_s: float, now: float
 ) -> tuple[Supervised, Objection | None]:
     """Look at a command that just arrived; hold it if it is good.
 
@@ -162,7 +162,7 @@ def admit(
 
 
 def step(
-    limits: Limits, state: Supervised, charge: str, max_age_s: float, now: float
+    limits: VelocityLimits, state: Supervised, charge: str, max_age_s: float, now: float
 ) -> tuple[Supervised, tuple[Objection, ...]]:
     """Decide what the wheels are told now: the ``velocity`` of the new state.
 
@@ -188,7 +188,7 @@ def step(
     return replace(state, velocity=velocity), objections
 
 
-def wants_standstill(limits: Limits, state: Supervised, charge: str, max_age_s: float, now: float) -> bool:
+def wants_standstill(limits: VelocityLimits, state: Supervised, charge: str, max_age_s: float, now: float) -> bool:
     """Whether a command is followed, and it is one to stand. Arguments as those of `step`."""
     command = state.held.get(charge)
     if command is None or _objection_while_held(limits, command, max_age_s, now) is not None:
@@ -205,7 +205,7 @@ def begin_anew(state: Supervised, now: float) -> Supervised:
     return Supervised(held=held, since=now)
 
 
-def max_age(limits: Limits, source: str, max_rtt_s: float | None) -> float:
+def max_age(limits: VelocityLimits, source: str, max_rtt_s: float | None) -> float:
     """Oldest information that a source may act on [s].
 
     From the cloud: what a service needs of the round trip, and the time that a command may be repeated. The clock
@@ -227,7 +227,7 @@ _UNUSED_MOST = 1e-3
 """A speed along an axis that the wheels do not have which is some planner's rounding [m/s, rad/s]."""
 
 
-def elapsed(limits: Limits, state: Supervised, now: float) -> float:
+def elapsed(limits: VelocityLimits, state: Supervised, now: float) -> float:
     """Time [s] that the step at ``now`` counts for: since the last one, or a period when the clock does not say."""
     if state.now is not None and isfinite(now) and now > state.now:
         return min(now - state.now, limits.max_step_s)
@@ -245,7 +245,7 @@ def _advance(state: Supervised, now: float) -> Supervised:
 
 
 def _objection_at_arrival(
-    limits: Limits, state: Supervised, command: Command, max_age_s: float, now: float
+    limits: VelocityLimits, state: Supervised, command: Command, max_age_s: float, now: float
 ) -> Objection | None:
     if not (isfinite(command.linear) and isfinite(command.angular) and isfinite(command.unused)):
         return Objection.NOT_FINITE
@@ -260,7 +260,9 @@ def _objection_at_arrival(
     return objection
 
 
-def _objection_while_held(limits: Limits, command: Command | None, max_age_s: float, now: float) -> Objection | None:
+def _objection_while_held(
+    limits: VelocityLimits, command: Command | None, max_age_s: float, now: float
+) -> Objection | None:
     """Comparisons are written so that a NaN anywhere objects."""
     if command is None:
         return Objection.NO_COMMAND
@@ -279,14 +281,16 @@ def _objection_while_held(limits: Limits, command: Command | None, max_age_s: fl
     return None
 
 
-def _brake(limits: Limits, velocity: Velocity, dt: float) -> Velocity:
+def _brake(limits: VelocityLimits, velocity: Velocity, dt: float) -> Velocity:
     return Velocity(
         _approach(velocity.linear, 0.0, limits.linear_braking * dt),
         _approach(velocity.angular, 0.0, limits.angular_braking * dt),
     )
 
 
-def _follow(limits: Limits, velocity: Velocity, command: Command, dt: float) -> tuple[Velocity, tuple[Objection, ...]]:
+def _follow(
+    limits: VelocityLimits, velocity: Velocity, command: Command, dt: float
+) -> tuple[Velocity, tuple[Objection, ...]]:
     linear = min(max(command.linear, limits.linear_min), limits.linear_max)
     angular = min(max(command.angular, -limits.angular_max), limits.angular_max)
     reached = Velocity(

@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 from skytether.control.admittance import STANDSTILL, Velocity
 
 from .command import Hand
-from .supervisor import Limits, Supervised
+from .supervisor import Supervised, VelocityLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class AsksWhy(Protocol):
         ...
 
 
-def rebase(limits: Limits, state: Supervised, told: WheelsFeedback) -> Supervised:
+def rebase(limits: VelocityLimits, state: Supervised, told: WheelsFeedback) -> Supervised:
     """Go on from what the wheels were told.
 
     What the agent said in the meantime is under way: its own velocity counts as far as the wheels can have come towards

@@ -10,7 +10,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.ros.names import Generation, Names, namespace_of, resolve
 from skytether.ros.permissions import NOTHING_MORE, Allowed, Permissions
 
-from ..control.supervisor import Limits
+from ..control.supervisor import VelocityLimits
 from .graph_base import IDLE_S, protected_names
 
 
@@ -44,7 +44,7 @@ class RobotGraphConfig:
     remap: Mapping[str, str] = field(default_factory=dict)
     cmd_vel: str | None = "cmd_vel"
     idle_s: float | None = IDLE_S
-    fresh_s: float = Limits().watchdog_s
+    fresh_s: float = VelocityLimits().watchdog_s
     readings: Mapping[str, str] = field(default_factory=dict)
     topics: Collection[str] = ()
     allowed: Allowed = NOTHING_MORE

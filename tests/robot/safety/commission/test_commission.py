@@ -4,10 +4,10 @@ import pytest
 from rig_wheels import Drives
 
 from skytether.guard.velocity import Velocity
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.commission.commission import Commission, CommissionError, Plan, Step, Stop, fit
 
-LIMITS = Limits(linear_max=0.5, angular_max=1.0, linear_braking=1.0, angular_braking=2.0)
+LIMITS = VelocityLimits(linear_max=0.5, angular_max=1.0, linear_braking=1.0, angular_braking=2.0)
 TURN = 0.01
 
 
@@ -58,7 +58,9 @@ class Person:
             self.rig.button = "press" in sentence.split()
 
 
-def bench(drives: Drives, *answers: bool, obeys: bool = True, limits: Limits = LIMITS) -> tuple[Commission, Person]:
+def bench(
+    drives: Drives, *answers: bool, obeys: bool = True, limits: VelocityLimits = LIMITS
+) -> tuple[Commission, Person]:
     rig = FakeRig(drives)
     person = Person(rig, *answers, obeys=obeys)
     plan = Plan(limits, 0.2, Velocity(0.02, 0.05), button=True, enable=drives.enable_s is not None)

@@ -9,7 +9,7 @@ from depth_camera import Camera, Face, cloud_of, optical
 
 from skytether.messages import PointCloud2, Time
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import polygon
 from skytether.robot.safety.rules.rules import Decision, Gate, Rules
 from skytether.robot.safety.rules.zones import Zone
@@ -18,7 +18,7 @@ from skytether.robot.safety.sensing.coverage import UnseenParams
 from skytether.robot.safety.sensing.sensing import RangeSensor
 
 BOX = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
-LIMITS = Limits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)
 PERIOD = LIMITS.period_s
 CAMERA = Camera(near=0.2)
 MOUNT = CloudMount(x=CAMERA.x, z=CAMERA.z, pitch=CAMERA.pitch, range_max=4.0, max_z=0.8)

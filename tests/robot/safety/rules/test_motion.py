@@ -10,11 +10,11 @@ from played_wheels import Wheels, odometry
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Time, Twist, TwistStamped, Vector3
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.rules.motion import Fault, Motion, MotionParams, Seen
 from skytether.robot.safety.sensing.stamps import StampRule
 
-LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
 PARAMS = MotionParams()
 TURN, READING = 0.02, 0.05
 

@@ -9,7 +9,7 @@ from played_wheels import Wheels, odometry
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import circle
 from skytether.robot.safety.rules.motion import MotionParams
 from skytether.robot.safety.rules.real_motion import Handover, OdometryRules
@@ -18,7 +18,7 @@ from skytether.robot.safety.rules.sources import SourceParams, SourceRules
 from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 
 TURN = 0.02
-LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0, period_s=TURN, max_step_s=0.1)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.2, angular_max=1.0, period_s=TURN, max_step_s=0.1)
 ODOMETRY = OdometryRules()
 RULES = Rules(
     footprint=circle(0.3),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Joy, LaserScan, Time, Twist
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.control.supervisor import Limits, Objection
+from skytether.robot.control.supervisor import Objection, VelocityLimits
 from skytether.robot.log_throttle import LogThrottle
 from skytether.robot.safety.geometry.footprint import Points, polygon
 from skytether.robot.safety.rules.estop import ButtonParams
@@ -26,7 +26,7 @@ from skytether.robot.safety.sensing.ranges import Mount
 from skytether.robot.safety.sensing.sensing import RangeSensor
 
 FOOTPRINT = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
-LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
 RULES = Rules(
     footprint=FOOTPRINT,
     limits=LIMITS,

@@ -14,7 +14,7 @@ from skytether.messages import Bool, Header, Joy, Time, Twist, TwistStamped, Vec
 from skytether.robot.control import restart_interlock
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.control.restart_interlock import NEUTRAL_S
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import circle
 from skytether.robot.safety.rules import joystick
 from skytether.robot.safety.rules.estop import ButtonParams
@@ -26,7 +26,7 @@ from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 PERIOD = 0.01
 TIMEOUT = 0.5
 """Of the source that is looked at."""
-LIMITS = Limits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
 PAD = JoystickParams(deadman=0, linear_axis=0, angular_axis=1, linear=0.2, angular=0.4, deadzone=0.0)
 NAVIGATION, KEYBOARD = SourceParams("navigation", 20, 0.5), SourceParams("keyboard", 50, 0.3, stamped=True)
 RULES = Rules(

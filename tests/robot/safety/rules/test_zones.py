@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from skytether.control.admittance import STANDSTILL, Velocity
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.dead_reckoning import Variation
 from skytether.robot.safety.geometry.footprint import polygon
 from skytether.robot.safety.geometry.stopping import Stages
@@ -14,7 +14,7 @@ from skytether.robot.safety.rules.zones import Zone, ZoneParams, Zones
 # A square of 1 m; room of 0.1 m; braking 2 m/s^2 and 4 rad/s^2.
 SQUARE = polygon([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
 PARAMS = ZoneParams(stop_m=0.1, slow_m=0.5, slow_speed=0.1, hysteresis_m=0.05)
-FAST = Limits(linear_max=2.0, linear_min=-2.0, angular_max=2.0)
+FAST = VelocityLimits(linear_max=2.0, linear_min=-2.0, angular_max=2.0)
 # All stages together: 0.1 s.
 STAGES = Stages(sensing_s=0.0, period_s=0.01, guard_s=0.05, writer_s=0.0, wheels_s=0.03)
 STEADY = Variation(0.0, 0.0)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from skytether.messages import Header, LaserScan, Time
 from skytether.robot.control.command import Command, Hand
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import polygon
 from skytether.robot.safety.rules.rules import Decision, Gate, Rules
 from skytether.robot.safety.rules.zones import Zone
@@ -21,7 +21,7 @@ from skytether.robot.safety.sensing.ranges import Mount
 from skytether.robot.safety.sensing.sensing import RangeSensor
 
 BOX = polygon([(0.3, 0.25), (0.3, -0.25), (-0.3, -0.25), (-0.3, 0.25)])
-LIMITS = Limits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)
+LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.5, angular_max=1.0)
 SLOW = 0.1
 PERIOD = LIMITS.period_s
 

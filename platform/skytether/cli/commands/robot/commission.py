@@ -13,7 +13,7 @@ import typer
 from skytether.api.config_file import ConfigError
 from skytether.guard.velocity import Velocity
 from skytether.robot.config.gate_config import load_safety
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.commission.commission import Commission, CommissionError, Plan, Step
 from skytether.robot.safety.commission.rig import HardwareRig
 
@@ -44,7 +44,7 @@ def commission(
         return
 
     plan = Plan(
-        limits=settings.limits or Limits(),
+        limits=settings.limits or VelocityLimits(),
         reaction_s=settings.zones.reaction_s,
         tolerance=Velocity(odometry.linear_tolerance, odometry.angular_tolerance),
         button=settings.estop is not None,

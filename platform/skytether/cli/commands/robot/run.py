@@ -21,7 +21,7 @@ from skytether.robot.agent.diagnostics import Diagnostics
 from skytether.robot.agent.gated_hardware import GatedHardware
 from skytether.robot.config.robot_config import load_config, load_token
 from skytether.robot.control.fallback import FallbackError
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.graphs.graph_base import PublishesDiagnostics
 from skytether.robot.graphs.registry import keys
 from skytether.robot.offload.site_prober import TaskConfig
@@ -185,7 +185,7 @@ def agent_config(settings: RobotConfig, folder: Path, token: str) -> AgentConfig
         params=settings.params,
         fallback=settings.fallback.name,
         fallback_options=settings.fallback.options,
-        limits=Limits(**settings.limits),
+        limits=VelocityLimits(**settings.limits),
         needs=settings.needs.needs(),
         command_topic=settings.command_topic,
         rate_hz=settings.rate_hz,

@@ -12,7 +12,7 @@ from math import inf, isfinite
 from typing import Any, Protocol
 
 from skytether.guard.velocity import STANDSTILL, Velocity
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 BRAKING_SHARE, REACTION_SHARE = 0.8, 1.2
 """What is left of the measured braking, and made of the measured time: worn wheels, a load, a wet floor."""
@@ -76,7 +76,7 @@ class Plan:
         enable: Whether there is an enable signal.
     """
 
-    limits: Limits
+    limits: VelocityLimits
     reaction_s: float
     tolerance: Velocity
     button: bool

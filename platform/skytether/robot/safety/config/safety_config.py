@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from skytether.guard.kinematics import Bounds
 from skytether.messages import Bool, Encoding, Message, String
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 from skytether.ros.names import check_name, resolve
 
 from ...config_base import Numbers, Topic, no_switches
@@ -67,7 +67,7 @@ class SafetyConfig(SourcesConfig):
     """The whole section. `with_sections` adds a key for each kind of graph: then sensors and wheels are its topics."""
 
     footprint: OutlineConfig
-    limits: Limits | None = None
+    limits: VelocityLimits | None = None
     """Of the wheels, whoever drives; null: the file's own ``limits``."""
     zones: ZoneParams = ZoneParams()
     sensors: Annotated[dict[Topic, SensorConfig], Field(max_length=32)]
@@ -131,7 +131,7 @@ class SafetyConfig(SourcesConfig):
         self._check_display()
         if self.guard_s < 2 / self.rate_hz:
             raise ValueError(f"guard_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
-        limits = self.limits or Limits()
+        limits = self.limits or VelocityLimits()
         if limits.max_gap_s < 2 / self.rate_hz:
             raise ValueError(f"limits.max_gap_s must be two periods of rate_hz or more: {2 / self.rate_hz:g}")
         return self
@@ -183,7 +183,7 @@ class SafetyConfig(SourcesConfig):
     def rules(self) -> Rules:
         """The rules that follow."""
         stages = self.stages()
-        limits = replace(self.limits or Limits(), period_s=stages.period_s, max_step_s=stages.longest_step_s)
+        limits = replace(self.limits or VelocityLimits(), period_s=stages.period_s, max_step_s=stages.longest_step_s)
         footprint = self.footprint.footprint()
         return Rules(
             footprint=footprint,
@@ -212,7 +212,7 @@ class SafetyConfig(SourcesConfig):
 
     def _cut(self) -> list[str]:
         """What the limits take away from other numbers: people look for it in vain at the wheels."""
-        limits, pad, found = self.limits or Limits(), self.joystick, []
+        limits, pad, found = self.limits or VelocityLimits(), self.joystick, []
         if self.zones.slow_speed > limits.linear_max:
             found.append(
                 f"zones.slow_speed {self.zones.slow_speed:g} is above limits.linear_max {limits.linear_max:g}: "
@@ -266,7 +266,7 @@ class SafetyConfig(SourcesConfig):
 
     def bounds(self) -> Bounds:
         """What the wheels may do, as the guard takes it."""
-        limits = self.limits or Limits()
+        limits = self.limits or VelocityLimits()
         return Bounds(*(float(getattr(limits, name)) for name in Bounds._fields))
 
     def frozen(self) -> SafetyConfig:

@@ -15,7 +15,7 @@ _ROUNDING = 1e-9
 
 
 class Rates(Protocol):
-    """How fast velocities may change; `skytether.robot.control.supervisor.Limits` has them [m/s^2, rad/s^2]."""
+    """How fast velocities may change; `skytether.robot.control.supervisor.VelocityLimits` has them [m/s^2, rad/s^2]."""
 
     @property
     def linear_acceleration(self) -> float:

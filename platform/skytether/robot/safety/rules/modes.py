@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import inf, nan
 
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from ..geometry.footprint import Footprint, polygon
 from .zones import ZoneParams
@@ -47,7 +47,7 @@ class Envelope:
         footprint: Outline with all that it carries.
     """
 
-    limits: Limits
+    limits: VelocityLimits
     zones: ZoneParams
     footprint: Footprint
 

@@ -22,7 +22,7 @@ from math import copysign, exp, inf, isfinite, nan
 
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Message, Odometry, Twist, TwistStamped
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from ..sensing.stamps import Stamp, StampRule, Stamps, date
 
@@ -113,7 +113,7 @@ class Motion:
         gap_s: Time without a word to the wheels that counts as standstill [s].
     """
 
-    def __init__(self, params: MotionParams, limits: Limits, gap_s: float) -> None:
+    def __init__(self, params: MotionParams, limits: VelocityLimits, gap_s: float) -> None:
         self._params = params
         self._gap_s = gap_s
         rest = exp(-_LAGS)

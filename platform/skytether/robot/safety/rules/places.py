@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from ..geometry.footprint import Footprint
 from ..geometry.stopping import Stages
@@ -25,7 +25,7 @@ class Place:
         unseen: Moving where no sensor looks.
     """
 
-    limits: Limits
+    limits: VelocityLimits
     footprint: Footprint
     stages: Stages
     zones: Zones

@@ -7,7 +7,7 @@ from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.messages import Message
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from ..sensing.coverage import Action
 from .motion import Motion, MotionParams
@@ -44,7 +44,7 @@ class Handover:
         tolerance: Difference that is noise.
     """
 
-    def __init__(self, limits: Limits, tolerance: Velocity) -> None:
+    def __init__(self, limits: VelocityLimits, tolerance: Velocity) -> None:
         self._rates = Velocity(limits.linear_acceleration, limits.angular_acceleration)
         self._most = Velocity(max(limits.linear_max, -limits.linear_min), limits.angular_max)
         self._tolerance = tolerance
@@ -101,7 +101,7 @@ class RealMotion:
         gap_s: Time without a word to the wheels that counts as standstill [s].
     """
 
-    def __init__(self, rules: OdometryRules, limits: Limits, gap_s: float) -> None:
+    def __init__(self, rules: OdometryRules, limits: VelocityLimits, gap_s: float) -> None:
         self._rules = rules
         self._motion = Motion(rules.params, limits, gap_s)
         tolerance = Velocity(rules.params.linear_tolerance, rules.params.angular_tolerance)

@@ -15,7 +15,7 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Message, String
 from skytether.robot.control import supervisor
 from skytether.robot.control.command import UNUSED_AXES, Command
-from skytether.robot.control.supervisor import Limits, Objection, Supervised
+from skytether.robot.control.supervisor import Objection, Supervised, VelocityLimits
 
 from ...control.command import Hand
 from ..geometry import kinematics as reach
@@ -54,7 +54,7 @@ class Rules:
     """
 
     footprint: Footprint
-    limits: Limits = field(default_factory=Limits)
+    limits: VelocityLimits = field(default_factory=VelocityLimits)
     zones: ZoneParams = field(default_factory=ZoneParams)
     sensors: Mapping[str, RangeSensor] = field(default_factory=dict)
     unseen: UnseenParams = field(default_factory=UnseenParams)

@@ -17,7 +17,7 @@ from skytether.messages import Bool, Joy, Message, Twist, TwistStamped
 from skytether.robot.control import restart_interlock
 from skytether.robot.control.command import Command, Hand, unused_axes
 from skytether.robot.control.restart_interlock import RestartInterlock
-from skytether.robot.control.supervisor import Limits, with_gap
+from skytether.robot.control.supervisor import VelocityLimits, with_gap
 
 from ..sensing.stamps import StampRule, Stamps, date
 from . import estop, joystick
@@ -130,7 +130,7 @@ class Sources:
         stopped: Why the robot is to stand until somebody resets it; empty: it is not.
     """
 
-    def __init__(self, rules: SourceRules, limits: Limits, stopped: str = "") -> None:
+    def __init__(self, rules: SourceRules, limits: VelocityLimits, stopped: str = "") -> None:
         self._rules = rules
         self._limits = limits
         self._joystick = Joystick()
@@ -253,7 +253,7 @@ class Sources:
             return Hand.NOBODY
         return self._first(floor, now, troubles)
 
-    def limits(self, hand: str) -> Limits:
+    def limits(self, hand: str) -> VelocityLimits:
         """The supervisor's limits while that one drives."""
         params = self._rules.joystick
         if hand == Hand.JOYSTICK and params is not None:

@@ -21,7 +21,7 @@ from pydantic import ConfigDict
 
 from skytether.control.admittance import Velocity
 from skytether.control.numbers import check_positive
-from skytether.robot.control.supervisor import Limits
+from skytether.robot.control.supervisor import VelocityLimits
 
 from ..geometry import kinematics
 from ..geometry.dead_reckoning import Variation
@@ -115,7 +115,7 @@ class Zones:
         stages: Latencies from the light to the brakes.
     """
 
-    def __init__(self, params: ZoneParams, footprint: Footprint, limits: Limits, stages: Stages) -> None:
+    def __init__(self, params: ZoneParams, footprint: Footprint, limits: VelocityLimits, stages: Stages) -> None:
         self._outlines = Outlines(footprint, params.stop_m)
         self.stop = self._outlines.least
         self._params = params
