@@ -9,7 +9,7 @@ from skytether.lab.measures import measure
 from skytether.lab.trail import Trail
 from skytether.lab.walk import World
 from skytether.messages import Twist, Vector3, encode
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.supervisor import VelocityLimits
@@ -26,7 +26,7 @@ class Walk:
     def __init__(self, **options):
         self.base = WalkerHardware(World(Trail(), seed=1))
         self.base.walking.set()
-        self.driver = ControlLoop(self.base, HoldTrail(**options), VelocityLimits(), Needs(), 100.0)
+        self.driver = ControlLoop(self.base, HoldTrail(**options), VelocityLimits(), LinkRequirements(), 100.0)
         self.base.source = lambda: self.driver.source
         self.ticks = count(1)
         self.told = []

@@ -8,7 +8,7 @@ from skytether.lab.world.agent import CATCH_UP, Clockwork, WorldGraph, WorldHard
 from skytether.lab.world.plan import building
 from skytether.lab.world.simulation import TICK, Simulation
 from skytether.messages import LaserScan, String, Twist, Vector3, decode, encode
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Stop
 from skytether.robot.control.supervisor import VelocityLimits
@@ -53,7 +53,7 @@ def test_an_unknown_topic_name_is_refused() -> None:
 
 def test_the_robots_control_loop_runs_on_it() -> None:
     base = WorldHardware(Clockwork(Simulation(building(), seed=1)))
-    driver = ControlLoop(base, Stop(), VelocityLimits(), Needs(), 0.0)
+    driver = ControlLoop(base, Stop(), VelocityLimits(), LinkRequirements(), 0.0)
     for tick in range(24):
         driver.tick(tick * TICK)
     status = driver.status()

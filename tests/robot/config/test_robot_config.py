@@ -3,7 +3,7 @@ import pytest
 from skytether.api.config_file import ConfigError
 from skytether.robot.config.gate_config import load_safety
 from skytether.robot.config.robot_config import load_config, load_token
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.ros.permissions import Allowed
 from skytether.ros.ros1.config import DEFAULT_MASTER
 
@@ -152,7 +152,7 @@ def test_a_name_that_is_none_cannot_be_listed(read):
 
 
 def test_the_link_has_needs_of_the_robot_s_own(read):
-    assert read().needs.needs() == Needs(max_rtt_s=1.0, max_loss=0.5, max_late=0.5)
+    assert read().needs.needs() == LinkRequirements(max_rtt_s=1.0, max_loss=0.5, max_late=0.5)
     assert read("ros1: {}\nneeds: {max_rtt_ms: 300}").needs.needs().max_rtt_s == 0.3
 
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.robot.control.arbiter import Choice, Link, Needs, Reason, choose, start
+from skytether.robot.control.arbiter import Choice, Link, LinkRequirements, Reason, choose, start
 from skytether.robot.control.command import Source
 
-NEEDS = Needs(max_rtt_s=0.6, max_loss=0.2)
+NEEDS = LinkRequirements(max_rtt_s=0.6, max_loss=0.2)
 TICK = 0.01
 GOOD = Link(connected=True, rtt=0.1, loss=0.0, clock_error=0.05)
 
@@ -41,9 +41,9 @@ def test_the_robot_is_on_its_own_until_the_link_was_good_for_long_enough():
 def test_the_local_source_may_be_stop_but_not_cloud():
     assert start(replace(NEEDS, local=Source.STOP), 0.0).source is Source.STOP
     with pytest.raises(ValueError, match="local"):
-        Needs(local=Source.CLOUD)
+        LinkRequirements(local=Source.CLOUD)
     with pytest.raises(ValueError, match="good_s"):
-        Needs(good_s=0)
+        LinkRequirements(good_s=0)
 
 
 def test_without_commands_the_robot_is_on_its_own_after_the_time_out(driving):
@@ -103,7 +103,7 @@ def test_a_bad_moment_on_the_way_back_starts_it_anew(bad):
 
 
 def test_what_nobody_needs_does_not_count():
-    needs = Needs(max_rtt_s=None, max_loss=None)
+    needs = LinkRequirements(max_rtt_s=None, max_loss=None)
     choice = start(needs, 0.0)
     for i in range(200):
         now = i * TICK

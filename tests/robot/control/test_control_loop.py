@@ -6,11 +6,11 @@ from math import nan
 
 import pytest
 
-from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import LinkRequirements as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
-from skytether.robot.control.arbiter import Needs, Reason
+from skytether.robot.control.arbiter import LinkRequirements, Reason
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance, Stop
@@ -38,7 +38,7 @@ class Rig:
         self.base = base
         self.now = 100.0
         self.driver = ControlLoop(
-            base, fallback or Admittance(), limits or VelocityLimits(), Needs(), self.now, observer
+            base, fallback or Admittance(), limits or VelocityLimits(), LinkRequirements(), self.now, observer
         )
         self._make_cloud = cloud
         self.epochs = count(1)

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import LinkRequirements as ServiceNeeds
 from skytether.api.manifest import TopicSpec
-from skytether.robot.control.arbiter import Link, Needs, Reason
+from skytether.robot.control.arbiter import Link, LinkRequirements, Reason
 from skytether.robot.control.service_manager import ServiceManager, Terms, explain, terms, tighten
 from skytether.robot.session.link_quality import LinkMonitor, Quality
 from skytether.wire.stats import SessionStats, TopicStats
@@ -54,7 +54,7 @@ def test_a_service_too_slow_for_the_robots_limits_is_told():
 @pytest.mark.parametrize("reason", list(Reason))
 def test_every_hand_over_is_explained_whatever_is_unknown(reason):
     for link in (Link(), Link(True, 1.0, nan, nan, nan, nan), Link(True, 5.0, 0.3, 0.2, 0.1, inf)):
-        for needs in (Needs(), replace(Needs(), max_rtt_s=0.1, max_loss=0.1)):
+        for needs in (LinkRequirements(), replace(LinkRequirements(), max_rtt_s=0.1, max_loss=0.1)):
             sentence = explain(reason, needs, link, Quality(), 5.2)
             assert sentence
             assert "\n" not in sentence
@@ -65,7 +65,7 @@ NUMBER = st.one_of(st.none(), st.floats(0, 1e308), st.sampled_from([inf, nan, 0.
 
 @given(rtt=NUMBER, loss=NUMBER, late=st.floats(0, 1e308), period=NUMBER)
 def test_no_answer_widens_what_the_robot_needs(rtt, loss, late, period):
-    own = Needs(max_rtt_s=0.4, max_loss=0.3, max_late=0.2)
+    own = LinkRequirements(max_rtt_s=0.4, max_loss=0.3, max_late=0.2)
     needs = tighten(own, Terms(rtt, loss, late, period))
     assert needs.max_rtt_s is not None
     assert needs.max_rtt_s <= 0.4
@@ -77,4 +77,6 @@ def test_no_answer_widens_what_the_robot_needs(rtt, loss, late, period):
 
 
 def test_a_stricter_service_is_held_to_its_own_needs():
-    assert tighten(Needs(), Terms(0.1, 0.05, 0.05)) == Needs(max_rtt_s=0.1, max_loss=0.05, max_late=0.05)
+    assert tighten(LinkRequirements(), Terms(0.1, 0.05, 0.05)) == LinkRequirements(
+        max_rtt_s=0.1, max_loss=0.05, max_late=0.05
+    )

@@ -6,7 +6,7 @@ from math import inf, nan
 import pytest
 
 from skytether.robot.agent.clocks import read_clocks
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.robot.control.command import Source
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance
@@ -27,7 +27,7 @@ class Robot:
         self.now, self.boot = 100.0, 5000.0
         self.stopped = 0.0
         """How long it is stopped after each begin of a tick, before it writes [s]."""
-        self.driver = ControlLoop(base, Admittance(), LIMITS, Needs(), self.now, None, self.clocks)
+        self.driver = ControlLoop(base, Admittance(), LIMITS, LinkRequirements(), self.now, None, self.clocks)
         session = LiveSession("1", frozenset({"force"}), "cmd_vel", count(1))
         session.open(lambda port: bridge, ("127.0.0.1", 1))
         self.bridge = bridge

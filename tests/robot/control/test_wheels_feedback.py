@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from skytether.control.admittance import Velocity
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.robot.control.control_loop import ControlLoop
 from skytether.robot.control.fallback import Admittance
 from skytether.robot.control.supervisor import VelocityLimits
@@ -20,7 +20,7 @@ STEP = LIMITS.linear_acceleration * TICK
 def gated(base):
     base.answer = None
     base.told = lambda now: base.answer
-    driver = ControlLoop(base, Admittance(), LIMITS, Needs(), 100.0)
+    driver = ControlLoop(base, Admittance(), LIMITS, LinkRequirements(), 100.0)
     now = 100.0
 
     def run(seconds):

@@ -10,7 +10,7 @@ from typing import Any
 from skytether.api import rest
 from skytether.bridge.interfaces import Wanted
 
-from ..control.arbiter import Needs
+from ..control.arbiter import LinkRequirements
 from ..control.supervisor import VelocityLimits
 from ..offload.site_prober import TaskConfig
 
@@ -61,7 +61,7 @@ class AgentConfig:
     fallback: str = "stop"
     fallback_options: Mapping[str, Any] = field(default_factory=dict)
     limits: VelocityLimits = field(default_factory=VelocityLimits)
-    needs: Needs = field(default_factory=Needs)
+    needs: LinkRequirements = field(default_factory=LinkRequirements)
     command_topic: str = "cmd_vel"
     rate_hz: float = 100.0
     lease_s: float = 15.0

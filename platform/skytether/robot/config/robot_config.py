@@ -17,7 +17,7 @@ from skytether.api.plain_http import is_readable_on_the_way
 from skytether.bridge.local_network import LocalNetwork
 from skytether.robot.agent.status import DEFAULT_PORT
 from skytether.robot.config_base import no_switches
-from skytether.robot.control.arbiter import Needs
+from skytether.robot.control.arbiter import LinkRequirements
 from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.graphs.graph_base import protected_names as graph_names
 from skytether.robot.graphs.graph_config import RobotGraphConfig
@@ -62,9 +62,9 @@ class LinkNeeds(Strict):
     max_late: Annotated[float, Field(ge=0, le=0.95)] = 0.5
     """Share of a topic's messages that may come too late to be used."""
 
-    def needs(self) -> Needs:
+    def needs(self) -> LinkRequirements:
         """For the source choice."""
-        return Needs(max_rtt_s=self.max_rtt_ms / 1000, max_loss=self.max_loss, max_late=self.max_late)
+        return LinkRequirements(max_rtt_s=self.max_rtt_ms / 1000, max_loss=self.max_loss, max_late=self.max_late)
 
 
 class CloudConfig(Strict):

@@ -44,7 +44,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Needs:
+class LinkRequirements:
     """What the link must be like, and how patient the arbiter is. The defaults are the robot's own.
 
     What a service needs only tightens them (`skytether.robot.control.service_manager.tighten`).
@@ -123,12 +123,12 @@ class Choice:
     bad_since: float | None = None
 
 
-def start(needs: Needs, now: float) -> Choice:
+def start(needs: LinkRequirements, now: float) -> Choice:
     """Before the first command of the cloud the robot is on its own."""
     return Choice(needs.local, Reason.START, now)
 
 
-def choose(needs: Needs, choice: Choice, link: Link, now: float) -> Choice:
+def choose(needs: LinkRequirements, choice: Choice, link: Link, now: float) -> Choice:
     """Decide who drives. The result has another ``source`` only when it changed; then ``reason`` says why."""
     trouble = _trouble(needs, link, now)
     if trouble is None and link.owes:
@@ -155,7 +155,7 @@ def _begin(since: float | None, now: float) -> float:
     return since if since is not None and since <= now else now
 
 
-def _trouble(needs: Needs, link: Link, now: float) -> Reason | None:
+def _trouble(needs: LinkRequirements, link: Link, now: float) -> Reason | None:
     if not link.connected:
         return Reason.DISCONNECTED
     if link.command_at is None or not isfinite(now) or not now - link.command_at <= needs.command_timeout_s:

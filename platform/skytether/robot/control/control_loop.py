@@ -20,7 +20,7 @@ from ..log_throttle import LogThrottle
 from ..session.link_quality import Quality
 from ..session.session import LiveSession
 from . import arbiter, restart_interlock, service_manager, supervisor
-from .arbiter import Choice, Link, Needs
+from .arbiter import Choice, Link, LinkRequirements
 from .command import UNUSED_AXES, Command, Source, unused_axes
 from .failure_detector import AccrualDetector
 from .fallback import Fallback, Reading, Watching
@@ -155,7 +155,7 @@ class ControlLoop:
         hardware: RobotHardware,
         fallback: Fallback,
         limits: VelocityLimits,
-        needs: Needs,
+        needs: LinkRequirements,
         now: float,
         observer: Observer | None = None,
         clocks: Clocks | None = None,

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite
 
-from skytether.api.manifest import Needs as ServiceNeeds
+from skytether.api.manifest import LinkRequirements as ServiceNeeds
 from skytether.api.manifest import TopicSpec
 from skytether.wire.stats import SessionStats
 
 from ..session.link_quality import LinkMonitor, Quality
-from .arbiter import Link, Needs, Reason
+from .arbiter import Link, LinkRequirements, Reason
 from .failure_detector import LEAST_PERIODS
 
 MOST_LATE = 0.5
@@ -55,7 +55,7 @@ def terms(needs: ServiceNeeds, topics: Sequence[TopicSpec], command_topic: str) 
     )
 
 
-def tighten(own: Needs, terms: Terms) -> Needs:
+def tighten(own: LinkRequirements, terms: Terms) -> LinkRequirements:
     """What the link must be like: the robot's own needs, and the service's where they are stricter.
 
     The terms come from the orchestrator, and whatever it answers widens nothing. A number that is none is no need.
@@ -125,7 +125,7 @@ class ServiceManager:
         return found
 
 
-def explain(reason: Reason, needs: Needs, link: Link, quality: Quality, now: float) -> str:
+def explain(reason: Reason, needs: LinkRequirements, link: Link, quality: Quality, now: float) -> str:
     """One line on why who drives has changed, with the number asked for and the number found."""
     match reason:
         case Reason.NO_COMMAND:
