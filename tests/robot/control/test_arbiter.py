@@ -6,15 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.robot.control.arbiter import Choice, Link, LinkRequirements, Reason, choose, start
+from skytether.robot.control.arbiter import Choice, LinkRequirements, LinkState, Reason, choose, start
 from skytether.robot.control.command import Source
 
 NEEDS = LinkRequirements(max_rtt_s=0.6, max_loss=0.2)
 TICK = 0.01
-GOOD = Link(connected=True, rtt=0.1, loss=0.0, clock_error=0.05)
+GOOD = LinkState(connected=True, rtt=0.1, loss=0.0, clock_error=0.05)
 
 
-def run(choice: Choice, link: Link, seconds: float, now: float, *, commands: bool = True) -> tuple[Choice, float]:
+def run(choice: Choice, link: LinkState, seconds: float, now: float, *, commands: bool = True) -> tuple[Choice, float]:
     """Tick with the same link; a command arrives at each tick unless told otherwise."""
     for _ in range(round(seconds / TICK)):
         now += TICK
@@ -132,7 +132,7 @@ def test_half_a_second_of_round_trip_with_jitter_and_loss_within_needs_does_not_
         while arrivals and arrivals[0] <= now:
             command_at = arrivals.pop(0)
         rtt = 0.5 + abs(random.gauss(0, 0.03))
-        link = Link(True, command_at, rtt=rtt, loss=0.1, clock_error=0.25)
+        link = LinkState(True, command_at, rtt=rtt, loss=0.1, clock_error=0.25)
         before, choice = choice, choose(NEEDS, choice, link, now)
         changes += before.source is not choice.source
     assert changes == 1
@@ -141,7 +141,7 @@ def test_half_a_second_of_round_trip_with_jitter_and_loss_within_needs_does_not_
 
 wild = st.sampled_from([nan, inf, -inf, 0.0, 1e300, 5e-324, -1.0])
 links = st.builds(
-    Link,
+    LinkState,
     connected=st.booleans() | st.just(True),
     command_at=st.none() | st.floats(-0.5, 0.01) | st.just(0.0) | wild,  # relative to now
     rtt=st.floats(0, 1) | st.just(0.1) | wild,

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skytether.api.manifest import LinkRequirements as ServiceNeeds
 from skytether.api.manifest import TopicSpec
-from skytether.robot.control.arbiter import Link, LinkRequirements, Reason
+from skytether.robot.control.arbiter import LinkRequirements, LinkState, Reason
 from skytether.robot.control.service_manager import ServiceManager, Terms, explain, terms, tighten
 from skytether.robot.session.link_quality import LinkMonitor, Quality
 from skytether.wire.stats import SessionStats, TopicStats
@@ -53,7 +53,7 @@ def test_a_service_too_slow_for_the_robots_limits_is_told():
 
 @pytest.mark.parametrize("reason", list(Reason))
 def test_every_hand_over_is_explained_whatever_is_unknown(reason):
-    for link in (Link(), Link(True, 1.0, nan, nan, nan, nan), Link(True, 5.0, 0.3, 0.2, 0.1, inf)):
+    for link in (LinkState(), LinkState(True, 1.0, nan, nan, nan, nan), LinkState(True, 5.0, 0.3, 0.2, 0.1, inf)):
         for needs in (LinkRequirements(), replace(LinkRequirements(), max_rtt_s=0.1, max_loss=0.1)):
             sentence = explain(reason, needs, link, Quality(), 5.2)
             assert sentence

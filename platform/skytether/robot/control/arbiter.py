@@ -82,7 +82,7 @@ class LinkRequirements:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkState:
     """What is known of the link now; NaN where nothing was measured.
 
     Attributes:
@@ -128,7 +128,7 @@ def start(needs: LinkRequirements, now: float) -> Choice:
     return Choice(needs.local, Reason.START, now)
 
 
-def choose(needs: LinkRequirements, choice: Choice, link: Link, now: float) -> Choice:
+def choose(needs: LinkRequirements, choice: Choice, link: LinkState, now: float) -> Choice:
     """Decide who drives. The result has another ``source`` only when it changed; then ``reason`` says why."""
     trouble = _trouble(needs, link, now)
     if trouble is None and link.owes:
@@ -155,7 +155,7 @@ def _begin(since: float | None, now: float) -> float:
     return since if since is not None and since <= now else now
 
 
-def _trouble(needs: LinkRequirements, link: Link, now: float) -> Reason | None:
+def _trouble(needs: LinkRequirements, link: LinkState, now: float) -> Reason | None:
     if not link.connected:
         return Reason.DISCONNECTED
     if link.command_at is None or not isfinite(now) or not now - link.command_at <= needs.command_timeout_s:

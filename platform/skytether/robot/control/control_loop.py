@@ -20,7 +20,7 @@ from ..log_throttle import LogThrottle
 from ..session.link_quality import Quality
 from ..session.session import LiveSession
 from . import arbiter, restart_interlock, service_manager, supervisor
-from .arbiter import Choice, Link, LinkRequirements
+from .arbiter import Choice, LinkRequirements, LinkState
 from .command import UNUSED_AXES, Command, Source, unused_axes
 from .failure_detector import AccrualDetector
 from .fallback import Fallback, Reading, Watching
@@ -386,7 +386,7 @@ class ControlLoop:
 
     def _choose(self, now: float) -> None:
         held = self._supervised.held.get(Source.CLOUD)
-        link = Link(
+        link = LinkState(
             connected=self.session is not None and self.session.connected,
             command_at=now - self._quiet if isfinite(self._quiet) else None,
             rtt=self.quality.rtt,

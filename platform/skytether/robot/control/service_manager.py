@@ -18,7 +18,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.wire.stats import SessionStats
 
 from ..session.link_quality import LinkMonitor, Quality
-from .arbiter import Link, LinkRequirements, Reason
+from .arbiter import LinkRequirements, LinkState, Reason
 from .failure_detector import LEAST_PERIODS
 
 MOST_LATE = 0.5
@@ -125,7 +125,7 @@ class ServiceManager:
         return found
 
 
-def explain(reason: Reason, needs: LinkRequirements, link: Link, quality: Quality, now: float) -> str:
+def explain(reason: Reason, needs: LinkRequirements, link: LinkState, quality: Quality, now: float) -> str:
     """One line on why who drives has changed, with the number asked for and the number found."""
     match reason:
         case Reason.NO_COMMAND:
