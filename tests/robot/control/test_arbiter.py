@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skytether.robot.control.arbiter import Choice, LinkRequirements, LinkState, Reason, choose, start
+from skytether.robot.control.arbiter import ArbiterDecision, LinkRequirements, LinkState, Reason, choose, start
 from skytether.robot.control.command import Source
 
 NEEDS = LinkRequirements(max_rtt_s=0.6, max_loss=0.2)
@@ -14,7 +14,9 @@ TICK = 0.01
 GOOD = LinkState(connected=True, rtt=0.1, loss=0.0, clock_error=0.05)
 
 
-def run(choice: Choice, link: LinkState, seconds: float, now: float, *, commands: bool = True) -> tuple[Choice, float]:
+def run(
+    choice: ArbiterDecision, link: LinkState, seconds: float, now: float, *, commands: bool = True
+) -> tuple[ArbiterDecision, float]:
     """Tick with the same link; a command arrives at each tick unless told otherwise."""
     for _ in range(round(seconds / TICK)):
         now += TICK
@@ -23,7 +25,7 @@ def run(choice: Choice, link: LinkState, seconds: float, now: float, *, commands
 
 
 @pytest.fixture
-def driving() -> tuple[Choice, float]:
+def driving() -> tuple[ArbiterDecision, float]:
     choice, now = run(start(NEEDS, 0.0), GOOD, 1.1, 0.0)
     assert choice.source is Source.CLOUD
     return choice, now

@@ -105,7 +105,7 @@ class LinkState:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class ArbiterDecision:
     """Who drives, why, since when.
 
     Attributes:
@@ -123,30 +123,30 @@ class Choice:
     bad_since: float | None = None
 
 
-def start(needs: LinkRequirements, now: float) -> Choice:
+def start(needs: LinkRequirements, now: float) -> ArbiterDecision:
     """Before the first command of the cloud the robot is on its own."""
-    return Choice(needs.local, Reason.START, now)
+    return ArbiterDecision(needs.local, Reason.START, now)
 
 
-def choose(needs: LinkRequirements, choice: Choice, link: LinkState, now: float) -> Choice:
+def choose(needs: LinkRequirements, choice: ArbiterDecision, link: LinkState, now: float) -> ArbiterDecision:
     """Decide who drives. The result has another ``source`` only when it changed; then ``reason`` says why."""
     trouble = _trouble(needs, link, now)
     if trouble is None and link.owes:
-        owing = choice if choice.source is needs.local else Choice(needs.local, Reason.NEUTRAL, now)
+        owing = choice if choice.source is needs.local else ArbiterDecision(needs.local, Reason.NEUTRAL, now)
         return replace(owing, good_since=_begin(choice.good_since, now), bad_since=None)
     if trouble is None:
         good_since = _begin(choice.good_since, now)
         if choice.source is Source.CLOUD:
             return replace(choice, good_since=good_since, bad_since=None)
         if now - good_since >= needs.good_s:
-            return Choice(Source.CLOUD, Reason.RECOVERED, now, good_since=good_since)
+            return ArbiterDecision(Source.CLOUD, Reason.RECOVERED, now, good_since=good_since)
         return replace(choice, source=needs.local, good_since=good_since, bad_since=None)
     bad_since = _begin(choice.bad_since, now)
     if choice.source is not Source.CLOUD:
         return replace(choice, source=needs.local, good_since=None, bad_since=bad_since)
     at_once = trouble in (Reason.NO_COMMAND, Reason.DISCONNECTED)
     if at_once or now - bad_since >= needs.bad_s:
-        return Choice(needs.local, trouble, now, bad_since=bad_since)
+        return ArbiterDecision(needs.local, trouble, now, bad_since=bad_since)
     return replace(choice, good_since=None, bad_since=bad_since)
 
 

@@ -20,7 +20,7 @@ from ..log_throttle import LogThrottle
 from ..session.link_quality import Quality
 from ..session.session import LiveSession
 from . import arbiter, restart_interlock, service_manager, supervisor
-from .arbiter import Choice, LinkRequirements, LinkState
+from .arbiter import ArbiterDecision, LinkRequirements, LinkState
 from .command import UNUSED_AXES, Command, Source, unused_axes
 from .failure_detector import AccrualDetector
 from .fallback import Fallback, Reading, Watching
@@ -188,7 +188,7 @@ class ControlLoop:
         self._command_before = (0, 0)
         """Handshake and sequence of the newest that was admitted."""
         self._log_throttle = LogThrottle(_log)
-        self._choice: Choice = arbiter.start(self._needs, now)
+        self._choice: ArbiterDecision = arbiter.start(self._needs, now)
         self._supervised = Supervised()
         self._why = "no command has come yet"
         self._now = now
