@@ -12,7 +12,7 @@ from skytether.wire.stats import SessionStats
 
 from ..control.control_loop import ControlStatus
 from ..graphs.wheels_watch import NOBODY, Others
-from ..offload.task_manager import Decision
+from ..offload.task_manager import OffloadDecision
 from ..session.counter_totals import COUNTERS, CounterTotals
 
 
@@ -52,7 +52,7 @@ class AgentStatus:
     overruns: int
     log_lines_dropped: int = 0
     late: float = nan
-    decision: Decision | None = None
+    decision: OffloadDecision | None = None
     load: float = nan
     battery: float | None = None
     others: Others = NOBODY

@@ -23,7 +23,7 @@ from skytether.api.exposition import Family, Sums, counter, exposition, gauge
 from skytether.api.hosts import is_own
 from skytether.api.report_metrics import of_report
 
-from ..offload.task_manager import Decision, Option
+from ..offload.task_manager import OffloadDecision, Option
 from .snapshot import AgentStatus
 
 _log = logging.getLogger(__name__)
@@ -298,7 +298,7 @@ def _topics(status: AgentStatus) -> list[dict[str, Any]]:
     return found
 
 
-def _decision(decision: Decision, now: float) -> dict[str, Any]:
+def _decision(decision: OffloadDecision, now: float) -> dict[str, Any]:
     challenger = decision.challenger
     return {
         "offload": decision.offload,

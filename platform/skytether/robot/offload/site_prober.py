@@ -23,7 +23,7 @@ from skytether.api.manifest import Manifest, Needs
 from skytether.bridge.echo import EchoClient
 
 from . import task_manager
-from .task_manager import Decision, PathQuality, Policy, RobotView, SiteView, Window
+from .task_manager import OffloadDecision, PathQuality, Policy, RobotView, SiteView, Window
 
 _log = logging.getLogger(__name__)
 
@@ -123,7 +123,7 @@ class SiteProber:
         self._told = ""
 
     @property
-    def decision(self) -> Decision:
+    def decision(self) -> OffloadDecision:
         """What stands now; from any thread."""
         return self._decision
 

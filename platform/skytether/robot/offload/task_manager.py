@@ -209,7 +209,7 @@ class Option:
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class OffloadDecision:
     """What to do.
 
     Attributes:
@@ -229,16 +229,16 @@ class Decision:
     challenger: tuple[Option, float] | None = None
 
 
-def start(policy: Policy, now: float) -> Decision:
+def start(policy: Policy, now: float) -> OffloadDecision:
     """Before anything is known: a robot does not wait for measurements to ask."""
     if policy.mode is Mode.LOCAL:
-        return Decision(False, None, "local: the configuration says mode local", now)
-    return Decision(True, None, "offload: nothing is measured yet, the orchestrator chooses the site", now)
+        return OffloadDecision(False, None, "local: the configuration says mode local", now)
+    return OffloadDecision(True, None, "offload: nothing is measured yet, the orchestrator chooses the site", now)
 
 
 def decide(
-    policy: Policy, before: Decision, needs: Needs, sites: Sequence[SiteView], robot: RobotView, now: float
-) -> Decision:
+    policy: Policy, before: OffloadDecision, needs: Needs, sites: Sequence[SiteView], robot: RobotView, now: float
+) -> OffloadDecision:
     """Look again.
 
     Args:
@@ -255,7 +255,7 @@ def decide(
     options = tuple(sorted(weigh(policy, needs, sites, robot), key=lambda option: option.cost))
     best = options[0]
     here = next((o for o in options if o.site == before.site and (o.site is not None) == before.offload), None)
-    standing = Decision(before.offload, before.site, before.why, before.since, options)
+    standing = OffloadDecision(before.offload, before.site, before.why, before.since, options)
     if policy.mode is Mode.LOCAL or best.refused:  # with nowhere to go one stays, and goes on asking
         return standing
     if here is None:
@@ -274,7 +274,7 @@ def decide(
     else:
         return standing
     if now - began < due:
-        return Decision(before.offload, before.site, before.why, before.since, options, (best, began))
+        return OffloadDecision(before.offload, before.site, before.why, before.since, options, (best, began))
     return _take(best, options, why, now)
 
 
@@ -286,13 +286,13 @@ def weigh(policy: Policy, needs: Needs, sites: Sequence[SiteView], robot: RobotV
     return options or [Option(None, refused="no site is known, and mode is offload")]
 
 
-def _take(option: Option, options: tuple[Option, ...], why: str, now: float) -> Decision:
+def _take(option: Option, options: tuple[Option, ...], why: str, now: float) -> OffloadDecision:
     verb = "local" if option.site is None else "offload"
     others = "; ".join(o.describe() for o in options if o is not option)
     line = f"{verb}: {option.describe()}"
     for more in (why or others,):
         line += f"; {more}" if more else ""
-    return Decision(option.site is not None, option.site, line, now, options)
+    return OffloadDecision(option.site is not None, option.site, line, now, options)
 
 
 def _site(policy: Policy, needs: Needs, site: SiteView, robot: RobotView) -> Option:
