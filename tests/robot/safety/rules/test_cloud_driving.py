@@ -11,7 +11,7 @@ from skytether.messages import PointCloud2, Time
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import polygon
-from skytether.robot.safety.rules.rules import Decision, Gate, Rules
+from skytether.robot.safety.rules.rules import Gate, GateDecision, Rules
 from skytether.robot.safety.rules.zones import Zone
 from skytether.robot.safety.sensing.clouds import CloudMount
 from skytether.robot.safety.sensing.coverage import UnseenParams
@@ -44,7 +44,7 @@ class Drive:
         self.sequence += 1
         self.gate.command(Command(Hand.AGENT, *wanted, 1, self.sequence, now, 0.0, now), now)
 
-    def run(self, message: PointCloud2 | None, wanted=(0.5, 0.0), seconds: float = 1.0) -> Decision:
+    def run(self, message: PointCloud2 | None, wanted=(0.5, 0.0), seconds: float = 1.0) -> GateDecision:
         for tick in range(round(seconds / PERIOD)):
             self.now += PERIOD
             if message is not None and tick % 4 == 0:  # at 25 Hz

@@ -13,7 +13,7 @@ from skytether.robot.config.gate_config import load_safety
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.safety.config.safety_config import SafetyConfig
 from skytether.robot.safety.rules.modes import Envelope, ModeRules, Modes
-from skytether.robot.safety.rules.rules import Decision, Gate
+from skytether.robot.safety.rules.rules import Gate, GateDecision
 
 SECTION = {
     "footprint": {"polygon": [[0.3, 0.2], [0.3, -0.2], [-0.3, -0.2], [-0.3, 0.2]]},
@@ -54,7 +54,7 @@ class Bench:
         self.ahead = 6.0
         self.run(0.3)
 
-    def run(self, seconds: float) -> Decision:
+    def run(self, seconds: float) -> GateDecision:
         for _ in range(round(seconds / 0.02)):
             self.now += 0.02
             self.sequence += 1

@@ -13,7 +13,7 @@ from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import circle
 from skytether.robot.safety.rules.motion import MotionParams
 from skytether.robot.safety.rules.real_motion import Handover, OdometryRules
-from skytether.robot.safety.rules.rules import Decision, Gate, Rules
+from skytether.robot.safety.rules.rules import Gate, GateDecision, Rules
 from skytether.robot.safety.rules.sources import SourceParams, SourceRules
 from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 
@@ -38,7 +38,7 @@ class Robot:
         self.odometry = True
         self.last = self.drive(0.0, 0.5)
 
-    def drive(self, linear: float, seconds: float = TURN, angular: float = 0.0) -> Decision:
+    def drive(self, linear: float, seconds: float = TURN, angular: float = 0.0) -> GateDecision:
         for _ in range(round(seconds / TURN)):
             self.now += TURN
             self.turns += 1

@@ -18,7 +18,7 @@ from skytether.robot.log_throttle import LogThrottle
 from skytether.robot.safety.geometry.footprint import Points, polygon
 from skytether.robot.safety.rules.estop import ButtonParams
 from skytether.robot.safety.rules.joystick import JoystickParams
-from skytether.robot.safety.rules.rules import Decision, Gate, Rules
+from skytether.robot.safety.rules.rules import Gate, GateDecision, Rules
 from skytether.robot.safety.rules.sources import SourceRules
 from skytether.robot.safety.rules.zones import Zone, ZoneParams
 from skytether.robot.safety.sensing.coverage import Action
@@ -70,7 +70,7 @@ class Bench:
         self.scans = self.buttons = self.commands = True
         self.sequence = self.unrest = 0
         self.wanted = (0.3, 0.0)
-        self.last: Decision | None = None
+        self.last: GateDecision | None = None
         self.neutral()
 
     def neutral(self) -> None:
@@ -85,7 +85,7 @@ class Bench:
         self.unrest += 1
         self.gate.sense("joy", joy(*axes, 0.001 * (self.unrest % 2)), self.now)
 
-    def run(self, seconds: float = PERIOD) -> Decision:
+    def run(self, seconds: float = PERIOD) -> GateDecision:
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
             if self.scans:

@@ -19,7 +19,7 @@ from skytether.robot.safety.geometry.footprint import circle
 from skytether.robot.safety.rules import joystick
 from skytether.robot.safety.rules.estop import ButtonParams
 from skytether.robot.safety.rules.joystick import RELEASED_S, Grip, Joystick, JoystickParams
-from skytether.robot.safety.rules.rules import Decision, Gate, Rules
+from skytether.robot.safety.rules.rules import Gate, GateDecision, Rules
 from skytether.robot.safety.rules.sources import LockParams, OnSilence, SourceParams, SourceRules
 from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 
@@ -67,7 +67,7 @@ class Bench:
         self.says = {"estop": Bool(), "pause": Bool(), "gone": Bool(), "joy": joy(0.0, 0.0, held=False)}
         self.run(0.3)
 
-    def run(self, seconds: float = PERIOD) -> Decision:
+    def run(self, seconds: float = PERIOD) -> GateDecision:
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
             self.sequence += 1

@@ -14,7 +14,7 @@ from skytether.messages import Header, LaserScan, Time
 from skytether.robot.control.command import Command, Hand
 from skytether.robot.control.supervisor import VelocityLimits
 from skytether.robot.safety.geometry.footprint import polygon
-from skytether.robot.safety.rules.rules import Decision, Gate, Rules
+from skytether.robot.safety.rules.rules import Gate, GateDecision, Rules
 from skytether.robot.safety.rules.zones import Zone
 from skytether.robot.safety.sensing.coverage import Action, UnseenParams
 from skytether.robot.safety.sensing.ranges import Mount
@@ -53,7 +53,7 @@ class Drive:
         self.sequence += 1
         self.gate.command(Command(Hand.AGENT, *wanted, 1, self.sequence, now, 0.0, now), now)
 
-    def run(self, message: LaserScan | None, wanted=(0.5, 0.0), seconds: float = 1.0, every: int = 1) -> Decision:
+    def run(self, message: LaserScan | None, wanted=(0.5, 0.0), seconds: float = 1.0, every: int = 1) -> GateDecision:
         for tick in range(round(seconds / PERIOD)):
             self.now += PERIOD
             if message is not None and tick % every == 0:

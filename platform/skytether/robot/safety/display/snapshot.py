@@ -12,7 +12,7 @@ import numpy as np
 
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.robot.safety.geometry.dead_reckoning import Variation
-from skytether.robot.safety.rules.rules import Decision
+from skytether.robot.safety.rules.rules import GateDecision
 from skytether.robot.safety.rules.zones import Asked, Zone
 
 MOST_POINTS = 4000
@@ -51,7 +51,9 @@ class Snapshot:
     asked: Asked
 
 
-def snapshot(decision: Decision, asked: Asked | None, told: Velocity, stopped: str, modes: Sequence[str]) -> Snapshot:
+def snapshot(
+    decision: GateDecision, asked: Asked | None, told: Velocity, stopped: str, modes: Sequence[str]
+) -> Snapshot:
     """Of the last turn; ``asked`` is None if it failed."""
     troubles = tuple(decision.troubles.values())
     return Snapshot(

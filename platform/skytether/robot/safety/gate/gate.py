@@ -45,7 +45,7 @@ from ..io.hardware import receive_known
 from ..io.io_factory import open_sensors, open_wheels
 from ..io.process_setup import SWITCH_S, log_without_waiting
 from ..protocol import COMMAND_SOCKET, CONTROL_SOCKET, DISPLAY_SOCKET, GateState, pack_state, unpack_command
-from ..rules.rules import Decision, Gate
+from ..rules.rules import Gate, GateDecision
 from .control import Control
 from .heartbeat import Heartbeat
 
@@ -110,7 +110,7 @@ class GateLoop:
         self._started = self._turned_at = clock()
         self._overruns = 0
         self._turns = 0
-        self._last: Decision | None = None
+        self._last: GateDecision | None = None
         self._said = STANDSTILL
 
     def run(self) -> None:
@@ -214,13 +214,13 @@ class GateLoop:
         if self._log_throttle.say(kind, sentence, now):
             self._heartbeat.note(sentence)
 
-    def _tell_agent(self, agent: Any, decision: Decision, now: float) -> None:
+    def _tell_agent(self, agent: Any, decision: GateDecision, now: float) -> None:
         told = self._heartbeat.told(now)
         state = GateState(now, told.velocity, told.at, self._stopped, decision.hand, self._gate.started)
         with suppress(OSError):  # it is gone, or does not read; it asks again
             self._commands.sendto(pack_state(state), agent)
 
-    def _show(self, feed: Feed, decision: Decision, now: float) -> None:
+    def _show(self, feed: Feed, decision: GateDecision, now: float) -> None:
         if self._clock() - now > self._period / 2:
             return  # a late turn has no time for it
         told, gate = self._heartbeat.told(now).velocity, self._gate

@@ -66,7 +66,7 @@ class Rules:
 
 
 @dataclass(frozen=True, slots=True)
-class Decision:
+class GateDecision:
     """What one step decided.
 
     Attributes:
@@ -223,7 +223,7 @@ class Gate:
         self._reckoning.tell(velocity, at if before is None else max(at, before))
         self._supervised = replace(self._supervised, velocity=velocity, now=at)
 
-    def step(self, now: float) -> Decision:
+    def step(self, now: float) -> GateDecision:
         """Decide what the wheels are told until the next step. Never raises; whatever fails stands still."""
         troubles: dict[str, str] = self._events
         self._events = {}
@@ -232,7 +232,7 @@ class Gate:
             decision = self._decide(now, troubles)
         except Exception as error:  # a bug in here must not keep the wheels turning
             troubles["internal"] = f"the gate itself failed and stops the robot: {type(error).__name__}: {error}"
-            decision = Decision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
+            decision = GateDecision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
             self._supervised = Supervised(held=self._supervised.held)
         self._reckoning.tell(decision.velocity, now)
         if self._motion is not None:
@@ -240,7 +240,7 @@ class Gate:
         self.counts.update(troubles.keys())
         return decision
 
-    def _decide(self, now: float, troubles: dict[str, str]) -> Decision:
+    def _decide(self, now: float, troubles: dict[str, str]) -> GateDecision:
         self._active = self._modes.active(now, troubles)
         self._place = place = self._places.of(self._active)
         before, dt = self._supervised.velocity, supervisor.elapsed(place.limits, self._supervised, now)
@@ -263,7 +263,7 @@ class Gate:
         if not (isfinite(velocity.linear) and isfinite(velocity.angular)):
             velocity = STANDSTILL
         self._supervised = replace(self._supervised, velocity=velocity)
-        return Decision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
+        return GateDecision(velocity, hand, allowed.zone, allowed.way, allowed.share, troubles)
 
     def _supervise(self, hand: str, now: float, troubles: dict[str, str]) -> Velocity:
         limits = supervisor.with_gap(self._place.limits, self._sources.limits(hand).max_gap_s)
