@@ -11,7 +11,7 @@ from played_wheels import Wheels, odometry
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Header, Time, Twist, TwistStamped, Vector3
 from skytether.robot.control.supervisor import VelocityLimits
-from skytether.robot.safety.rules.motion import Fault, Motion, MotionParams, Seen
+from skytether.robot.safety.rules.motion import Fault, Motion, MotionEstimate, MotionParams
 from skytether.robot.safety.sensing.stamps import StampRule
 
 LIMITS = VelocityLimits(linear_max=0.5, linear_min=-0.2, angular_max=1.0)
@@ -24,7 +24,7 @@ class Bench:
         self.motion = Motion(params, LIMITS, gap_s=0.1)
         self.wheels, self.now, self.turns = wheels, 100.0, 0
         self.faults: list[tuple[float, Fault, str]] = []
-        self.seen = Seen(None)
+        self.seen = MotionEstimate(None)
 
     def drive(self, velocity: Velocity, seconds: float) -> None:
         for _ in range(round(seconds / TURN)):

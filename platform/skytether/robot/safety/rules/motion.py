@@ -81,7 +81,7 @@ class MotionParams:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class MotionEstimate:
     """What is known of the real motion now.
 
     Attributes:
@@ -176,7 +176,7 @@ class Motion:
         """Forget how quick readings were, because a person looked at the robot."""
         self._stamps = Stamps()
 
-    def look(self, now: float) -> Seen:
+    def look(self, now: float) -> MotionEstimate:
         """What is known now. A fault is told once, in the look after the reading that showed it."""
         fault, self._fault = self._fault, None
         age = now - self._measured_at
@@ -187,7 +187,7 @@ class Motion:
             unknown = silent if isfinite(age) else "nothing has come yet"
             self._since.clear()
         measured = None if unknown else self._measured
-        return Seen(measured, unknown, *fault) if fault else Seen(measured, unknown)
+        return MotionEstimate(measured, unknown, *fault) if fault else MotionEstimate(measured, unknown)
 
     def _judge(self, now: float) -> None:
         begin = now - self._params.window_s
