@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.wire.codec.replay_window import ReplayWindow, Seen
+from skytether.wire.codec.replay_window import ReplayVerdict, ReplayWindow
 
 SIZE = ReplayWindow.SIZE
 steps = st.one_of(
@@ -17,10 +17,10 @@ def test_it_accepts_each_number_once_and_never_an_old_one(moves):
     for move in moves:
         number = max(0, highest + move)
         old = number <= highest - SIZE
-        expected = Seen.OLD if old else Seen.ACCEPTED if number in accepted else Seen.NEW
+        expected = ReplayVerdict.OLD if old else ReplayVerdict.ACCEPTED if number in accepted else ReplayVerdict.NEW
         assert window.check(number) is expected
-        assert window.accept(number) is (expected is Seen.NEW)
-        if expected is Seen.NEW:
+        assert window.accept(number) is (expected is ReplayVerdict.NEW)
+        if expected is ReplayVerdict.NEW:
             accepted.add(number)
             highest = max(highest, number)
         assert window.highest == highest
@@ -31,5 +31,5 @@ def test_a_jump_over_the_whole_window_forgets_nothing_that_matters():
     for number in range(100):
         window.accept(number)
     window.accept(99 + SIZE)
-    assert window.check(99) is Seen.OLD
-    assert window.check(100) is Seen.NEW  # the ring's slots of 0 to 98 were cleared
+    assert window.check(99) is ReplayVerdict.OLD
+    assert window.check(100) is ReplayVerdict.NEW  # the ring's slots of 0 to 98 were cleared

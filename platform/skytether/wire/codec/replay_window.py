@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 
-class Seen(Enum):
+class ReplayVerdict(Enum):
     """What the window knows of a number."""
 
     NEW = 0
@@ -33,13 +33,13 @@ class ReplayWindow:
         self.highest = -1
         """Highest number accepted."""
 
-    def check(self, number: int) -> Seen:
+    def check(self, number: int) -> ReplayVerdict:
         """Without changing anything."""
         if number > self.highest:
-            return Seen.NEW
+            return ReplayVerdict.NEW
         if number <= self.highest - self.SIZE:
-            return Seen.OLD
-        return Seen.ACCEPTED if self._ring[number % self.SIZE] else Seen.NEW
+            return ReplayVerdict.OLD
+        return ReplayVerdict.ACCEPTED if self._ring[number % self.SIZE] else ReplayVerdict.NEW
 
     def accept(self, number: int) -> bool:
         """Remember an authenticated number.

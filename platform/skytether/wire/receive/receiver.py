@@ -31,7 +31,7 @@ from ..codec.packet import (
     pull_packets,
 )
 from ..codec.plaintext import INNER, OVERHEAD, PREFIX
-from ..codec.replay_window import Seen
+from ..codec.replay_window import ReplayVerdict
 from ..config import Config
 from ..connect.handshake import MAX_HANDSHAKE
 from ..connect.handshake_driver import HandshakeMessage
@@ -308,9 +308,9 @@ class Receiver:
         if number > epoch.replay.highest:  # as nearly always
             return False
         seen = epoch.replay.check(number)
-        if seen is Seen.NEW:
+        if seen is ReplayVerdict.NEW:
             return False
-        if seen is Seen.OLD:
+        if seen is ReplayVerdict.OLD:
             self.rejected["old"] += packets
         elif receiver is not None:
             receiver.counters.duplicate += packets
