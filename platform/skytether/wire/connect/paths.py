@@ -48,7 +48,7 @@ class Exchange(NamedTuple):
     peer_sent: float
 
 
-class Choice(NamedTuple):
+class PathChoice(NamedTuple):
     """Where to send."""
 
     active: Path
@@ -89,7 +89,7 @@ class Paths:
         """The path of an id; asked twice for every packet."""
         self._numbers: dict[int, int] = {}
         """Next packet numbers of paths that are closed: none is used twice with the same keys."""
-        self.choice = Choice(first, None, False)
+        self.choice = PathChoice(first, None, False)
         self._overlap_until = -math.inf
         self._previous: Path | None = None
         """The active path before, while the overlap lasts."""
@@ -372,7 +372,7 @@ class Paths:
         self._chosen_at = now
         if len(self._paths) == 1:
             only = next(iter(self))
-            self._set(Choice(only, None, False), "closed" if only is not active else "", now)
+            self._set(PathChoice(only, None, False), "closed" if only is not active else "", now)
             return
         others = [p for p in self if p is not active and p.address is not None]
         best = self._best(others, now) if others else None
@@ -390,7 +390,7 @@ class Paths:
             usable = [p for p in others if p.liveness.health(now) is not Health.DEAD]
             other = self._best(usable, now) if usable else None
         doubled = other is not None and (overlap or active.liveness.health(now) is not Health.LIVE)
-        self._set(Choice(active, other, doubled), "", now)
+        self._set(PathChoice(active, other, doubled), "", now)
 
     @staticmethod
     def _best(paths: Iterable[Path], now: float) -> Path:
@@ -421,9 +421,9 @@ class Paths:
         self._previous = self.choice.active if reason != "closed" else None
         self._overlap_until = now + self._config.path_overlap
         self._better_since = None
-        self._set(Choice(path, self._previous, self._previous is not None), reason, now)
+        self._set(PathChoice(path, self._previous, self._previous is not None), reason, now)
 
-    def _set(self, choice: Choice, reason: str, now: float) -> None:
+    def _set(self, choice: PathChoice, reason: str, now: float) -> None:
         if choice != self.choice:
             self.choice = choice
             self._sender.use(self, *choice, now)
