@@ -38,7 +38,7 @@ class AlarmRow:
         busy: Programs that took a processor each meanwhile.
         commands: That arrived.
         hand_overs: Times that the robot's own controller took over, though nothing was cut.
-        stalls: Times that the robot's control loop stood still for more than `Limits.watchdog_s`.
+        stalls: Times that the robot's control loop stood still for more than `VelocityLimits.watchdog_s`.
         gap_p99_ms: 99th percentile of the time between two commands.
         gap_max_ms: The longest.
         limit_ms: The silence that would have been too long, at the end.

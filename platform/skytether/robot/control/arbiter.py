@@ -50,7 +50,8 @@ class LinkRequirements:
     What a service needs only tightens them (`skytether.robot.control.service_manager.tighten`).
 
     Attributes:
-        max_rtt_s: Round trip [s]; None: any. The oldest information that may drive is by `Limits.max_gap_s` older.
+        max_rtt_s: Round trip [s]; None: any. The oldest information that may drive is by
+            `VelocityLimits.max_gap_s` older.
         max_loss: Share of messages; None: any but all.
         max_late: Share of a topic's messages that may miss their lifespan.
         max_clock_error_s: Largest bound of the clock offset's error [s].

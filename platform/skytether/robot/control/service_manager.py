@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite
 
-from skytether.api.manifest import LinkRequirements as ServiceNeeds
-from skytether.api.manifest import TopicSpec
+from skytether.api.manifest import Needs, TopicSpec
 from skytether.wire.stats import SessionStats
 
 from ..session.link_quality import LinkMonitor, Quality
@@ -44,7 +43,7 @@ class Terms:
     period_s: float | None = None
 
 
-def terms(needs: ServiceNeeds, topics: Sequence[TopicSpec], command_topic: str) -> Terms:
+def terms(needs: Needs, topics: Sequence[TopicSpec], command_topic: str) -> Terms:
     """Read them from what the manifest needs, and from its row of the command topic."""
     period = next((t.period_ms for t in topics if (t.name, t.direction) == (command_topic, "out")), None)
     return Terms(
