@@ -11,7 +11,7 @@ import pytest
 from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
 from skytether.guard.kinematics import Bounds
-from skytether.guard.protocol import Beat, Told
+from skytether.guard.protocol import Beat, LastCommand
 from skytether.guard.teller import Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
@@ -69,7 +69,7 @@ class One:
 def both():
     file = board.make()
     with closing(board.Board(file)) as page:
-        page.put(Role.FIRST, Entry(Told(FAST, 0.98)))  # by who had the role before
+        page.put(Role.FIRST, Entry(LastCommand(FAST, 0.98)))  # by who had the role before
     first, second = One(file, Role.FIRST), One(file, Role.SECOND)
     yield first, second
     for one in (first, second):
@@ -280,8 +280,8 @@ def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
     for i in range(5):
         before.turn(1.0 + i * PERIOD)
     after = One(file, Role.SECOND)
-    assert after.board.of(Role.SECOND) == (Told(STANDSTILL, 1.08), 1.0)
-    after.board.put(Role.FIRST, Entry(Told(FAST, 1.1)))
+    assert after.board.of(Role.SECOND) == (LastCommand(STANDSTILL, 1.08), 1.0)
+    after.board.put(Role.FIRST, Entry(LastCommand(FAST, 1.1)))
     assert not after.turn(1.12)
     assert isnan(after.board.of(Role.SECOND).claim)  # what a dead one has claimed is given back by the next
     os.close(file)
@@ -290,16 +290,16 @@ def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
 def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
     file = board.make()
     page = Board(file)
-    assert page.newest() == Told()
+    assert page.newest() == LastCommand()
     for at in (1.0, 2.0, 3.0):
-        page.put(Role.FIRST, Entry(Told(FAST, at), at))
+        page.put(Role.FIRST, Entry(LastCommand(FAST, at), at))
     with mmap.mmap(file, 4096) as memory:  # as who dies while it writes leaves it
         memory[memory.find(struct.pack("<d", 3.0))] ^= 1
-    assert page.of(Role.FIRST) == Entry(Told(FAST, 2.0), 2.0)
-    page.put(Role.FIRST, Entry(Told(STANDSTILL, 4.0)))
-    assert page.newest() == Told(STANDSTILL, 4.0)
-    page.put(Role.SECOND, Entry(Told(FAST, 5.0)))
-    assert Board(file).newest() == Told(FAST, 5.0)  # as another process sees it
+    assert page.of(Role.FIRST) == Entry(LastCommand(FAST, 2.0), 2.0)
+    page.put(Role.FIRST, Entry(LastCommand(STANDSTILL, 4.0)))
+    assert page.newest() == LastCommand(STANDSTILL, 4.0)
+    page.put(Role.SECOND, Entry(LastCommand(FAST, 5.0)))
+    assert Board(file).newest() == LastCommand(FAST, 5.0)  # as another process sees it
     with pytest.raises(PermissionError):
         os.ftruncate(file, 0)
     os.close(file)

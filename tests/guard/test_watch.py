@@ -9,7 +9,7 @@ from skytether.guard.kinematics import Bounds
 from skytether.guard.protocol import (
     Answer,
     Beat,
-    Told,
+    LastCommand,
     pack_answer,
     pack_beat,
     pack_note,
@@ -82,14 +82,14 @@ def test_a_gap_a_failed_write_and_nothing_at_all_are_a_standstill(then):
 def test_what_somebody_else_told_the_wheels_later_counts():
     watch = driving()
     watch.hear(Beat(1.02, Velocity(0.2, 0.4)))
-    watch.learn(Told(Velocity(0.1, 0.2), 1.01))
+    watch.learn(LastCommand(Velocity(0.1, 0.2), 1.01))
     assert told(watch, 1.02)[0] == pytest.approx((0.11, 0.22))
     watch.hear(Beat(1.04, Velocity(0.11, 0.22)))
-    watch.learn(Told(STANDSTILL, 1.01))  # before what was told last
+    watch.learn(LastCommand(STANDSTILL, 1.01))  # before what was told last
     assert told(watch, 1.04)[0] == pytest.approx((0.11, 0.22))
-    watch.learn(Told(Velocity(nan, 0.0), 1.05))
-    watch.learn(Told())
-    assert watch.told == Told((0.11, 0.22), 1.04)
+    watch.learn(LastCommand(Velocity(nan, 0.0), 1.05))
+    watch.learn(LastCommand())
+    assert watch.told == LastCommand((0.11, 0.22), 1.04)
 
 
 def test_stopped_brakes_whatever_is_wanted():

@@ -16,7 +16,7 @@ from math import isfinite, nan
 from typing import NamedTuple
 from zlib import crc32
 
-from .protocol import Told
+from .protocol import LastCommand
 from .velocity import Velocity
 
 _ENTRY = struct.Struct("<Qdddd")
@@ -39,7 +39,7 @@ class Role(IntEnum):
 class Entry(NamedTuple):
     """What one of them has written down."""
 
-    told: Told = Told()
+    told: LastCommand = LastCommand()
     claim: float = nan
     """Since when it wants to tell the wheels what the other one has told them so far [s]; NaN: it does not."""
 
@@ -71,7 +71,7 @@ class Board:
         """What somebody wrote down last."""
         return max(self._at(role, 0), self._at(role, 1), key=lambda found: found[0])[1]
 
-    def newest(self) -> Told:
+    def newest(self) -> LastCommand:
         """What the wheels were told last, by whomever."""
         first, second = self.of(Role.FIRST).told, self.of(Role.SECOND).told
         return first if not second.at >= first.at else second
@@ -87,7 +87,7 @@ class Board:
         if _SUM.unpack_from(data, _ENTRY.size)[0] != crc32(data[: _ENTRY.size]):
             return 0, Entry()
         count, linear, angular, at, claim = _ENTRY.unpack_from(data)
-        return count, Entry(Told(Velocity(linear, angular), at), claim)
+        return count, Entry(LastCommand(Velocity(linear, angular), at), claim)
 
 
 def make() -> int:

@@ -27,7 +27,7 @@ _ENABLE = (b"SkE3\x00", b"SkE3\x01")
 _LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
 
 
-class Told(NamedTuple):
+class LastCommand(NamedTuple):
     """What the wheels were told last, and when; ``at`` is NaN if they never were."""
 
     velocity: Velocity = STANDSTILL

@@ -27,7 +27,7 @@ from math import isnan, nan
 from typing import Protocol
 
 from .board import Board, Entry, Role
-from .protocol import Told
+from .protocol import LastCommand
 from .velocity import Velocity
 from .watch import Watch
 
@@ -204,7 +204,7 @@ class Teller:
         self._watch.failed(now)
         self._put(self._watch.told)
 
-    def _put(self, told: Told, claim: float | None = None) -> None:
+    def _put(self, told: LastCommand, claim: float | None = None) -> None:
         self._own, self._claim = told, self._claim if claim is None else claim
         self._board.put(self._role, Entry(self._own, self._claim))
 

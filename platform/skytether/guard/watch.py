@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import isfinite
 
 from .kinematics import Bounds, brake, toward
-from .protocol import Beat, Told
+from .protocol import Beat, LastCommand
 from .velocity import STANDSTILL, Velocity
 
 _ROUNDING = 1e-6
@@ -26,7 +26,7 @@ class Watch:
     """
 
     def __init__(self, bounds: Bounds, period_s: float, patience_s: float) -> None:
-        self.told = Told()
+        self.told = LastCommand()
         """What the wheels were told last."""
         self._bounds = bounds
         self._period_s = period_s
@@ -41,18 +41,18 @@ class Watch:
         """Whoever said what is wanted is gone."""
         self._beat = None
 
-    def learn(self, told: Told) -> None:
+    def learn(self, told: LastCommand) -> None:
         """Somebody else told the wheels something; the newest counts."""
         if not self.told.at >= told.at and isfinite(told.at) and _finite(told.velocity):
             self.told = told
 
     def wrote(self, velocity: Velocity, at: float) -> None:
         """The wheels were told so."""
-        self.told = Told(velocity, at)
+        self.told = LastCommand(velocity, at)
 
     def failed(self, at: float) -> None:
         """The wheels could not be told anything, or nobody listens."""
-        self.told = Told(STANDSTILL, at)
+        self.told = LastCommand(STANDSTILL, at)
 
     def want(self, now: float, stopped: bool = False) -> tuple[Velocity, str]:
         """Decide what the wheels are told now.

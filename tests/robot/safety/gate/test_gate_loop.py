@@ -16,7 +16,7 @@ from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
 from skytether.guard.claim import LOCK_FILE, Claim
 from skytether.guard.estop import FIRST_ACT, EstopFile, boot_id
-from skytether.guard.protocol import Answer, Beat, Told, pack_answer, unpack_beat, unpack_note
+from skytether.guard.protocol import Answer, Beat, LastCommand, pack_answer, unpack_beat, unpack_note
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool, Joy, LaserScan, Message, encode
 from skytether.robot.graphs.inbox import Topics
@@ -110,7 +110,7 @@ class Bench:
         except BlockingIOError:
             pass
         if answered:
-            self.board.put(Role.FIRST, Entry(Told(told or beat.velocity, self.now)))
+            self.board.put(Role.FIRST, Entry(LastCommand(told or beat.velocity, self.now)))
             self.guard.send(pack_answer(self.answer._replace(at=self.now)))
         return beat.velocity
 
@@ -187,9 +187,9 @@ def test_a_guard_that_tells_the_wheels_nothing_makes_the_gate_brake_the_wheels_i
     steps = [before - after for before, after in pairwise(told)]
     assert all(step <= 0.02 + 1e-9 for step in steps)
     assert told[-1] == 0.0
-    assert bench.board.newest() == Told(STANDSTILL, bench.now)
+    assert bench.board.newest() == LastCommand(STANDSTILL, bench.now)
     assert any("nobody else tells" in note for note in bench.notes)
-    bench.board.put(Role.FIRST, Entry(Told(STANDSTILL, bench.now)))
+    bench.board.put(Role.FIRST, Entry(LastCommand(STANDSTILL, bench.now)))
     bench.turn()
     count = len(bench.hardware.told)
     bench.link.send(Velocity(0.2, 0.0))
@@ -233,7 +233,7 @@ def test_a_guard_that_is_frozen_while_its_writer_tells_the_wheels_leaves_them_to
     drive(bench)
     for _ in range(20):
         bench.turn(answered=False)
-        bench.board.put(Role.FIRST, Entry(Told(Velocity(0.1, 0.0), bench.now)))
+        bench.board.put(Role.FIRST, Entry(LastCommand(Velocity(0.1, 0.0), bench.now)))
     assert not bench.hardware.told
 
 

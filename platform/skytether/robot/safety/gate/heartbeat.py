@@ -12,7 +12,7 @@ from contextlib import suppress
 
 from skytether.guard.board import Board, Role
 from skytether.guard.kinematics import Bounds
-from skytether.guard.protocol import LARGEST, Answer, Beat, Told, pack_beat, pack_note, unpack_answer
+from skytether.guard.protocol import LARGEST, Answer, Beat, LastCommand, pack_beat, pack_note, unpack_answer
 from skytether.guard.teller import Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
@@ -77,12 +77,12 @@ class Heartbeat:
             if answer is not None:
                 self.answer = answer
 
-    def told(self, now: float) -> Told:
+    def told(self, now: float) -> LastCommand:
         """What the wheels were told last; after a stall, a standstill."""
         told = self._watch.told
-        return told if now - told.at <= self._patience_s else Told(STANDSTILL, now)
+        return told if now - told.at <= self._patience_s else LastCommand(STANDSTILL, now)
 
-    def differs(self, said: Velocity, now: float) -> Told | None:
+    def differs(self, said: Velocity, now: float) -> LastCommand | None:
         """What the gate is to go on from instead of what it said; None: that is as good. See `differs`."""
         return differs(self._watch.told, said, now, self._patience_s, self._period_s)
 
@@ -129,7 +129,7 @@ class Heartbeat:
             self._guard.send(pack_note(sentence))
 
 
-def differs(told: Told, said: Velocity, now: float, patience_s: float, period_s: float) -> Told | None:
+def differs(told: LastCommand, said: Velocity, now: float, patience_s: float, period_s: float) -> LastCommand | None:
     """What the wheels were told if that is nearer to standstill than what the gate said; None: it is not. Pure.
 
     What is farther from standstill is the guard's to brake: a gate that went back to it would brake less.
@@ -142,9 +142,9 @@ def differs(told: Told, said: Velocity, now: float, patience_s: float, period_s:
         period_s: Of the gate's loop [s].
     """
     if not now - told.at <= patience_s:
-        return Told(STANDSTILL, now - period_s)
+        return LastCommand(STANDSTILL, now - period_s)
     if any(_nearer(t, s) for t, s in zip(told.velocity, said, strict=True)):
-        return Told(told.velocity, min(told.at, now - period_s / 100))
+        return LastCommand(told.velocity, min(told.at, now - period_s / 100))
     return None
 
 
