@@ -24,7 +24,7 @@ AGAIN_S = 5.0
 _REFUSED = 401
 
 
-class Told(Protocol):
+class ReportsGate(Protocol):
     """What this needs of `skytether.api.client.Client`."""
 
     def report_gate(self, name: str, report: GateReport) -> None:
@@ -45,7 +45,7 @@ class GateReporter:
 
     def __init__(
         self,
-        client: Told,
+        client: ReportsGate,
         robot: str,
         report: Callable[[], GateReport],
         *,
