@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skytether.control.admittance import Velocity
-from skytether.lab.safety.checker import Demand, Told, Wheels, check, tightest
+from skytether.lab.safety.checker import Demand, SentVelocity, Wheels, check, tightest
 from skytether.lab.safety.socket_hardware import steady
 from skytether.robot.control.supervisor import VelocityLimits
 
@@ -28,7 +28,7 @@ def drive(*legs, start=0.0, last=0.0):
             limit = LIMITS.linear_acceleration if abs(target) > abs(linear) else LIMITS.linear_braking
             change = limit * PERIOD
             linear += max(-change, min(change, target - linear))
-            told.append(Told(at, Velocity(linear, 0.0)))
+            told.append(SentVelocity(at, Velocity(linear, 0.0)))
             at += PERIOD
     return told
 
@@ -50,27 +50,27 @@ def test_a_good_drive_has_no_violation():
 @given(st.lists(st.floats(-0.015, 0.0), min_size=200, max_size=200))
 def test_a_clock_that_is_read_a_little_before_sending_is_no_violation(early):
     record = drive((0.5, 1.0), (0.0, 1.0), (0.5, 2.0))
-    shifted = [Told(told.at + shift, told.velocity) for told, shift in zip(record, early, strict=True)]
+    shifted = [SentVelocity(told.at + shift, told.velocity) for told, shift in zip(record, early, strict=True)]
     assert kinds(sorted(shifted, key=lambda told: told.at)) == []
 
 
 @pytest.mark.parametrize("velocity", [Velocity(0.6, 0.0), Velocity(-0.2, 0.0), Velocity(0.0, 0.9), Velocity(5.0, 0.0)])
 def test_too_fast(velocity):
-    assert "velocity" in kinds([Told(0.0, velocity), Told(0.02, velocity)])
+    assert "velocity" in kinds([SentVelocity(0.0, velocity), SentVelocity(0.02, velocity)])
 
 
 @pytest.mark.parametrize("bad", [nan, inf, -inf])
 def test_no_number(bad):
     record = drive((0.5, 1.0))
-    assert kinds([*record, Told(1.0, Velocity(bad, 0.0)), Told(1.02, Velocity(0.5, bad))]) == ["number"]
+    assert kinds([*record, SentVelocity(1.0, Velocity(bad, 0.0)), SentVelocity(1.02, Velocity(0.5, bad))]) == ["number"]
 
 
 def test_a_jump_up_and_down():
     record = drive((0.5, 1.0))
-    up = [Told(0.0, Velocity(0.0, 0.0)), Told(0.009, Velocity(0.41, 0.0))]
-    down = [*record, Told(1.0, Velocity(0.0, 0.0))]
-    turn = [Told(0.0, Velocity(0.0, 0.0)), Told(0.02, Velocity(0.0, 0.5))]
-    back = [*drive((0.3, 1.0)), Told(1.0, Velocity(-0.1, 0.0))]
+    up = [SentVelocity(0.0, Velocity(0.0, 0.0)), SentVelocity(0.009, Velocity(0.41, 0.0))]
+    down = [*record, SentVelocity(1.0, Velocity(0.0, 0.0))]
+    turn = [SentVelocity(0.0, Velocity(0.0, 0.0)), SentVelocity(0.02, Velocity(0.0, 0.5))]
+    back = [*drive((0.3, 1.0)), SentVelocity(1.0, Velocity(-0.1, 0.0))]
     for jump in (up, down, turn, back):
         assert kinds(jump) == ["acceleration"]
     assert check(up, [], WHEELS).acceleration_max == pytest.approx(0.41 / 0.029)
@@ -79,16 +79,16 @@ def test_a_jump_up_and_down():
 def test_a_judge_that_was_held_up_blames_nobody_and_sees_a_jump_all_the_same():
     """On a graph: for 0.15 s nothing was taken, then all at once; the times between are not known."""
     record = drive((0.5, 1.0), (0.0, 0.5))
-    late = [t if not 1.0 < t.at < 1.15 else Told(1.15, t.velocity, earliest=1.0) for t in record]
-    assert kinds([Told(t.at, t.velocity) for t in late]) == ["acceleration"]
+    late = [t if not 1.0 < t.at < 1.15 else SentVelocity(1.15, t.velocity, earliest=1.0) for t in record]
+    assert kinds([SentVelocity(t.at, t.velocity) for t in late]) == ["acceleration"]
     assert kinds(late) == []
-    jump = [*drive((0.5, 1.0)), Told(1.0, Velocity(0.0, 0.0), earliest=0.99)]
+    jump = [*drive((0.5, 1.0)), SentVelocity(1.0, Velocity(0.0, 0.0), earliest=0.99)]
     assert kinds(jump) == ["acceleration"]
 
 
 def test_a_change_that_is_too_fast_in_small_steps_does_not_hide_in_the_tolerance():
     """1.5 m/s^2 where 1 is allowed: each step is within the tolerance, all together are not."""
-    record = [Told(PERIOD * i, Velocity(min(0.5, 1.5 * PERIOD * i), 0.0)) for i in range(50)]
+    record = [SentVelocity(PERIOD * i, Velocity(min(0.5, 1.5 * PERIOD * i), 0.0)) for i in range(50)]
     assert kinds(record) == ["acceleration"]
 
 
@@ -100,7 +100,7 @@ def test_after_silence_the_robot_stands():
     # On the edge nobody knows whether they have stopped.
     assert kinds([*record, *drive((0.5, 1.0), start=1.08, last=0.5)]) == []
     assert kinds([*record, *drive((0.5, 1.0), start=1.08)]) == []
-    assert kinds([*record, Told(1.08, Velocity(0.25, 0.0))]) == ["acceleration"]
+    assert kinds([*record, SentVelocity(1.08, Velocity(0.25, 0.0))]) == ["acceleration"]
     # Somebody else took over just before they stopped, and brakes: right all the way down.
     assert kinds([*record, *drive((0.0, 1.0), start=1.085, last=0.3)]) == []
 
@@ -140,7 +140,7 @@ def test_what_may_have_begun_after_the_demand_is_no_motion():
 
 
 def test_turning_on_the_spot_is_no_standstill():
-    record = [Told(PERIOD * i, Velocity(0.0, 0.02)) for i in range(50)]
+    record = [SentVelocity(PERIOD * i, Velocity(0.0, 0.02)) for i in range(50)]
     assert kinds(record, Demand(0.0, 0.2, 0.9, "stopped")) == ["standstill"]
 
 

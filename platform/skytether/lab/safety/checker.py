@@ -8,7 +8,7 @@ decides, and sends; the kernel stamps what it sends, and in between the process 
 tolerance is the same for every stretch of up to `_STRETCH_S`, not for every message, so that it cannot add up.
 
 On a graph nobody knows when a message was sent, only when this process took it, and a process that was held up takes
-many at once: they were sent at some time since it looked before (`Told.earliest`). What is possible by some of these
+many at once: they were sent at some time since it looked before (`SentVelocity.earliest`). What is possible by some of these
 times is no violation: it would be one of whoever held up the judge.
 """
 
@@ -28,7 +28,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class SentVelocity:
     """One velocity that the wheels received.
 
     Attributes:
@@ -119,7 +119,7 @@ class Finding:
     standstill: tuple[float, float] | None
 
 
-def check(record: Sequence[Told], demands: Iterable[Demand], wheels: Wheels) -> Finding:
+def check(record: Sequence[SentVelocity], demands: Iterable[Demand], wheels: Wheels) -> Finding:
     """Hold a record against everything that is promised.
 
     Args:
@@ -159,12 +159,12 @@ def _is_finite(velocity: Velocity) -> bool:
     return isfinite(velocity.linear) and isfinite(velocity.angular)
 
 
-def _numbers(record: Sequence[Told], wheels: Wheels) -> list[Violation]:
+def _numbers(record: Sequence[SentVelocity], wheels: Wheels) -> list[Violation]:
     bad = [told for told in record if not _is_finite(told.velocity)]
     return _merge([(told.at, f"the wheels were told {tuple(told.velocity)}") for told in bad], "number", wheels)
 
 
-def _speeds(record: Sequence[Told], wheels: Wheels) -> list[Violation]:
+def _speeds(record: Sequence[SentVelocity], wheels: Wheels) -> list[Violation]:
     limits = wheels.limits
     return _merge(
         [
@@ -178,7 +178,7 @@ def _speeds(record: Sequence[Told], wheels: Wheels) -> list[Violation]:
     )
 
 
-def _changes(record: Sequence[Told], wheels: Wheels) -> tuple[list[Violation], float]:
+def _changes(record: Sequence[SentVelocity], wheels: Wheels) -> tuple[list[Violation], float]:
     """Every pair within a stretch: whether the later velocity could be reached from the earlier one."""
     found: list[tuple[float, str]] = []
     most = 0.0
@@ -191,7 +191,7 @@ def _changes(record: Sequence[Told], wheels: Wheels) -> tuple[list[Violation], f
     return _merge(found, "acceleration", wheels), most
 
 
-def _excess(before: Sequence[Told], after: Told, wheels: Wheels) -> tuple[float, str, float]:
+def _excess(before: Sequence[SentVelocity], after: SentVelocity, wheels: Wheels) -> tuple[float, str, float]:
     """By how much time [s] a velocity comes too early, after which one, and the largest change by its time [m/s^2]."""
     limits, jitter = wheels.limits, wheels.jitter_s
     worst, text, most = 0.0, "", 0.0
@@ -212,16 +212,16 @@ def _excess(before: Sequence[Told], after: Told, wheels: Wheels) -> tuple[float,
     return worst, text, most
 
 
-def _before(record: Sequence[Told], i: int, wheels: Wheels) -> list[list[Told]]:
+def _before(record: Sequence[SentVelocity], i: int, wheels: Wheels) -> list[list[SentVelocity]]:
     """What the velocity at ``i`` is compared with: what was told before, back to a standstill by silence.
 
     A gap on the edge of silence leaves two possibilities: the wheels had stopped, or just not yet.
     """
     now, later = record[i].at, record[i]
-    possible: list[list[Told]] = []
-    found: list[Told] = []
+    possible: list[list[SentVelocity]] = []
+    found: list[SentVelocity] = []
     for told in (record[j] for j in range(i - 1, -1, -1)):
-        stopped = [*found, Told(later.at, STANDSTILL, earliest=later.since)]
+        stopped = [*found, SentVelocity(later.at, STANDSTILL, earliest=later.since)]
         if later.since - told.at > wheels.silence_s + wheels.jitter_s:
             return [*possible, stopped]
         if later.at - told.since > wheels.silence_s - wheels.jitter_s:
@@ -256,7 +256,7 @@ class _Motion(NamedTuple):
     """When they turned for sure [s]."""
 
 
-def _motions(record: Sequence[Told], wheels: Wheels) -> list[_Motion]:
+def _motions(record: Sequence[SentVelocity], wheels: Wheels) -> list[_Motion]:
     """Neighbours that touch are one."""
     found: list[_Motion] = []
     for i, told in enumerate(record):
@@ -294,7 +294,7 @@ def _stands(motions: Sequence[_Motion], demand: Demand) -> tuple[list[Violation]
     return found, took
 
 
-def _slower(record: Sequence[Told], demand: Demand) -> list[Violation]:
+def _slower(record: Sequence[SentVelocity], demand: Demand) -> list[Violation]:
     """Whether the robot is as slow as demanded."""
     fast = [
         told

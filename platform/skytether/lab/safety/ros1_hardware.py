@@ -21,7 +21,7 @@ from skytether.messages import Bool, Joy, LaserScan, Message, Twist, decode, enc
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener
 
-from .checker import Told
+from .checker import SentVelocity
 from .record import WheelRecord
 
 _HOST = "127.0.0.1"
@@ -126,7 +126,7 @@ class Ros1Hardware:
             self._look()
         twist = decode(Twist, data, "ros1")
         # Of the look in the same turn of the thread's loop nobody knows whether it was before or after the message.
-        self.record.add(Told(now(), Velocity(twist.linear.x, twist.angular.z), earliest=self._looked[0]))
+        self.record.add(SentVelocity(now(), Velocity(twist.linear.x, twist.angular.z), earliest=self._looked[0]))
 
     def _look(self) -> None:
         self._looked.append(now())

@@ -18,7 +18,7 @@ from skytether.lab.bench.ros2_node import ros2_python
 from skytether.messages import Message, Twist, TwistStamped, encode
 
 from . import ros2_program
-from .checker import Told
+from .checker import SentVelocity
 from .record import WheelRecord
 
 _WHEELS = "/cmd_vel_safe"
@@ -117,4 +117,4 @@ class Ros2Hardware:
             self._joined.set()
             return
         taken, published, x, z = said
-        self.record.add(Told(taken, Velocity(x, z), earliest=min(published, taken)))
+        self.record.add(SentVelocity(taken, Velocity(x, z), earliest=min(published, taken)))

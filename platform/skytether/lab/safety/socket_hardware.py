@@ -15,7 +15,7 @@ from skytether.guard.clock import now
 from skytether.guard.velocity import Velocity
 from skytether.messages import DecodeError, Message, Twist, decode, encode
 
-from .checker import Told
+from .checker import SentVelocity
 from .record import WheelRecord
 
 _SO_TIMESTAMPNS = 35
@@ -132,7 +132,7 @@ class SocketHardware:
                 at = steady(seconds + nanoseconds * 1e-9)
             elif kind == socket.SCM_CREDENTIALS:
                 sender = _CREDENTIALS.unpack(value[: _CREDENTIALS.size])[0]
-        self.record.add(Told(at, Velocity(twist.linear.x, twist.angular.z), sender))
+        self.record.add(SentVelocity(at, Velocity(twist.linear.x, twist.angular.z), sender))
 
 
 def steady(wall_s: float, clock: Callable[[], float] = now, wall_clock: Callable[[], float] = time.time) -> float:

@@ -21,7 +21,7 @@ from skytether.robot.safety.gate.heartbeat import differs
 from skytether.robot.safety.rules.rules import Gate
 
 from .attacks import Attacks
-from .checker import Demand, Finding, Told, Violation, check
+from .checker import Demand, Finding, SentVelocity, Violation, check
 from .robot import RAYS, SAFETY, WANTED, scan_of
 from .stage import Promised, wheels_of
 
@@ -68,7 +68,7 @@ class _Rehearsed:
 
     def __init__(self, config: SafetyConfig) -> None:
         self.now = 1000.0
-        self.told: list[Told] = [Told(self.now, STANDSTILL)]
+        self.told: list[SentVelocity] = [SentVelocity(self.now, STANDSTILL)]
         self._period, self._patience = 1 / config.rate_hz, config.guard_s
         self._gate = Gate(config.rules())
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
@@ -109,4 +109,4 @@ class _Rehearsed:
         self._watch.hear(Beat(self.now, self._said))
         velocity, _ = self._watch.want(self.now)
         self._watch.wrote(velocity, self.now)
-        self.told.append(Told(self.now, velocity))
+        self.told.append(SentVelocity(self.now, velocity))

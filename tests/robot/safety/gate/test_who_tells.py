@@ -19,7 +19,7 @@ from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.guard.wheels import WriterWheels
-from skytether.lab.safety.checker import Demand, Told, Wheels, check
+from skytether.lab.safety.checker import Demand, SentVelocity, Wheels, check
 from skytether.robot.safety.config.safety_config import SafetyConfig
 from skytether.robot.safety.gate.heartbeat import Heartbeat
 from skytether.robot.safety.gate.writer import Writer
@@ -124,7 +124,7 @@ class Stage:
         self.writer.turn()
 
     def finding(self, *demands):
-        record = [Told(at, velocity) for at, _, velocity in self.told]
+        record = [SentVelocity(at, velocity) for at, _, velocity in self.told]
         return check(record, demands, Wheels(self.limits, PATIENCE, jitter_s=1e-6))
 
     def spoke(self, since):
