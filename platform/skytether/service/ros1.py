@@ -37,7 +37,7 @@ from .ros_graph import (
     take_from,
     with_setup,
 )
-from .ros_guard import CORE, Guard
+from .ros_guard import CORE, RosGuard
 
 _log = logging.getLogger("skytether.service.ros1")
 
@@ -51,7 +51,7 @@ class _Graph:
 
     program = "roslaunch"
 
-    def __init__(self, setting: Setting, node: Node, guard: Guard, arguments: Sequence[str]) -> None:
+    def __init__(self, setting: Setting, node: Node, guard: RosGuard, arguments: Sequence[str]) -> None:
         self._node = node
         self._notes: queue.SimpleQueue[Notes] = queue.SimpleQueue()
         self.guard = guard
@@ -91,7 +91,7 @@ def _set_params(node: Node, params: Mapping[str, object]) -> None:
             _log.error("parameter %s was not set: %s", name, error)
 
 
-def _wait_for_core(node: Node, guard: Guard) -> None:
+def _wait_for_core(node: Node, guard: RosGuard) -> None:
     deadline = time.monotonic() + _CORE_S
     while not node.master_present:
         ended = guard.ended()

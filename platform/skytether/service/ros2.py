@@ -41,7 +41,7 @@ from .ros_graph import (
     spaces_of,
     with_setup,
 )
-from .ros_guard import Guard
+from .ros_guard import RosGuard
 
 _log = logging.getLogger("skytether.service.ros2")
 
@@ -87,7 +87,7 @@ def generate_launch_description():
 class _Graph:
     """Implements `skytether.service.ros_graph.RosGraph`."""
 
-    def __init__(self, setting: Setting, node: RclpyNode, guard: Guard, command: list[str]) -> None:
+    def __init__(self, setting: Setting, node: RclpyNode, guard: RosGuard, command: list[str]) -> None:
         self.guard = guard
         self.program = Path(setting.launch).name
         self.command = command

@@ -40,7 +40,7 @@ from .beat import touch
 from .errors import ConfigError, ServiceError
 from .health_port import answering
 from .main import check_graph, read_grant, write_ready_file
-from .ros_guard import Guard
+from .ros_guard import RosGuard
 
 _log = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class RosGraph(Protocol):
         ...
 
     @property
-    def guard(self) -> Guard:
+    def guard(self) -> RosGuard:
         """Of its programs."""
         ...
 
@@ -237,9 +237,9 @@ def take_from(notes: queue.SimpleQueue[Notes], timeout: float, use: Callable[[No
 
 
 @contextmanager
-def guarding(folder: Path, environment: Mapping[str, str]) -> Iterator[Guard]:
+def guarding(folder: Path, environment: Mapping[str, str]) -> Iterator[RosGuard]:
     """A guard of the graph's programs, for as long as the context lasts."""
-    guard = Guard(folder, environment)
+    guard = RosGuard(folder, environment)
     try:
         yield guard
     finally:

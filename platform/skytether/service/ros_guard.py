@@ -31,7 +31,7 @@ _PATIENCE_S = 8.0
 """From the interrupt, by which roslaunch ends its nodes in order, to the kill."""
 
 
-class Guard:
+class RosGuard:
     """The service's side: starts the guard, gives it programs, hears of their ends.
 
     Args:
