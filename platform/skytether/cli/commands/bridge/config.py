@@ -40,7 +40,7 @@ class LinkConfig(Strict):
     seed: int = 0
 
 
-class Link(Strict):
+class EmulatedLink(Strict):
     """An emulated link between both ends."""
 
     up: LinkConfig = LinkConfig()
@@ -114,7 +114,7 @@ class BridgeConfig(Strict):
     """The graph at this end, one of the two; null: none, only ``sources``."""
     rate_mbps: Annotated[float, Field(gt=0)] | None = None
     """What this end may send; null: the protocol's default."""
-    link: Link | None = None
+    link: EmulatedLink | None = None
     """Between the two ends of role ``both``."""
 
     @property
