@@ -39,7 +39,7 @@ class RefusedError(NodeError):
 
 
 @dataclass(frozen=True)
-class Seen:
+class FirstAnswer:
     """Who answered a first call."""
 
     authority: str
@@ -71,7 +71,7 @@ def _context() -> ssl.SSLContext:
     return context
 
 
-def first_call(url: str, pin: str) -> Seen:
+def first_call(url: str, pin: str) -> FirstAnswer:
     """Find out who answers, before anything secret is said: only whose key the token names is believed.
 
     Raises:
@@ -92,7 +92,7 @@ def first_call(url: str, pin: str) -> Seen:
             "may be in between, or the address is another orchestrator's"
         )
     # This one certificate, and not the text: others may stand behind it there, which the pin says nothing of.
-    return Seen(authority.public_bytes(Encoding.PEM).decode(), welcome.time - time.time())
+    return FirstAnswer(authority.public_bytes(Encoding.PEM).decode(), welcome.time - time.time())
 
 
 def call(url: str, context: ssl.SSLContext, request: Strict, answer: type[Answer]) -> Answer:

@@ -19,7 +19,7 @@ from skytether.api.node import Invited, Issued, Join, Leave, Look, Standing, Sta
 from skytether.bridge.echo import EchoServer
 
 from . import checks, unit
-from .calls import RefusedError, Seen, UnreachableError, address_of, call, first_call, trusting
+from .calls import FirstAnswer, RefusedError, UnreachableError, address_of, call, first_call, trusting
 from .checks import Finding
 from .engine_rules import OWNER
 from .machine import EngineInfo, address_towards, ask, describe
@@ -182,7 +182,7 @@ def engine_path(engine: str) -> str:
 
 def _check(
     options: JoinOptions, pin: str, path: str, tell: Callable[[Finding], object]
-) -> tuple[str, Seen, EngineInfo | None]:
+) -> tuple[str, FirstAnswer, EngineInfo | None]:
     found: list[Finding] = []
 
     def note(finding: Finding) -> None:
@@ -214,7 +214,7 @@ def _check(
     return answered, seen, engine
 
 
-def _reach(urls: tuple[str, ...], pin: str, note: Callable[[Finding], object]) -> tuple[str, Seen | None]:
+def _reach(urls: tuple[str, ...], pin: str, note: Callable[[Finding], object]) -> tuple[str, FirstAnswer | None]:
     """The first orchestrator that answers, and is the one of the token."""
     failure = ""
     for url in urls:
