@@ -20,8 +20,8 @@ from skytether.lab.world.robot import RearParams, RobotParams
 from skytether.lab.world.simulation import TICK, Robot, Simulation
 from skytether.messages import LaserScan, Twist, Vector3
 from skytether_services.follow_in_front.formation import Formation, FormationParams, State
-from skytether_services.follow_in_front.operator import Choice, OperatorChoice
 from skytether_services.follow_in_front.operator import Operator as SeenOperator
+from skytether_services.follow_in_front.operator import OperatorChoice, OperatorState
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
 REAR = RearParams()
@@ -73,7 +73,7 @@ class Loop:
         self._command = Twist()
         self.path: list[tuple[float, float]] = []
         self.states: list[State] = []
-        self.choices: list[Choice] = []
+        self.choices: list[OperatorState] = []
         self.errors: list[float] = []
         self.aside: list[float] = []
         self.begun = math.nan

@@ -23,7 +23,7 @@ from .camera_image import Picture, PictureError, decode
 from .face_choice import FaceChoice, choose
 from .face_tracker import Face
 from .formation import Formation, State
-from .operator import Choice, Operator, OperatorChoice
+from .operator import Operator, OperatorChoice, OperatorState
 from .params import Params
 from .status import SENTENCES, Code
 from .tracker import PeopleTracker
@@ -219,7 +219,7 @@ class Follower:
         if now - self._scan_at + self._formation.doubt > self._params.stop_after:
             return Code.LATE
         if self._operator is None:
-            by_choice = {Choice.SEVERAL: Code.SEVERAL_PEOPLE, Choice.LOST: Code.OPERATOR_LOST}
+            by_choice = {OperatorState.SEVERAL: Code.SEVERAL_PEOPLE, OperatorState.LOST: Code.OPERATOR_LOST}
             return by_choice.get(self._choice.choice, Code.NO_OPERATOR)
         if now - self._operator.seen_at > slow:
             return Code.LATE if self._operator.seen_at >= self._scan_at else Code.OPERATOR_LOST

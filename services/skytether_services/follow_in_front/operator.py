@@ -17,7 +17,7 @@ OVER_LEGS = math.radians(14)
 """A face is this near to the direction of its legs: 0.2 m at 0.8 m, as far as one leans."""
 
 
-class Choice(StrEnum):
+class OperatorState(StrEnum):
     """How it stands with the operator.
 
     Attributes:
@@ -134,7 +134,7 @@ class OperatorChoice:
         self._appeared: set[int] = set()
         self._close = 0
         self._mixed_at = -math.inf
-        self.choice = Choice.NOBODY
+        self.choice = OperatorState.NOBODY
         """How it stands."""
         self.picked = 0
         """So many operators were picked so far."""
@@ -159,10 +159,10 @@ class OperatorChoice:
         if self._is_mixed_up(kept, people, now):
             self._last, self._mixed_at, self._next = None, now, None
         if 0 <= now - self._mixed_at < self._params.memory:
-            self.choice = Choice.SEVERAL
+            self.choice = OperatorState.SEVERAL
             return None
         if kept is None and self._last is not None and self._remembers(self._last, now):
-            self.choice = Choice.LOST
+            self.choice = OperatorState.LOST
             return None
         if kept is None:
             self._last = None
@@ -170,7 +170,7 @@ class OperatorChoice:
         if kept is None:
             return None
         self._last = _Last(kept.id, kept.place.copy(), kept.velocity.copy(), now, kept.seen_at)
-        self.choice = Choice.FOLLOWED
+        self.choice = OperatorState.FOLLOWED
         self._others &= {person.id for person in people}
         if kept.legs:
             self._others |= {person.id for person in people if person.known and person.legs and person is not kept}
@@ -245,7 +245,9 @@ class OperatorChoice:
             if sure or _perhaps(person):
                 found.append((abs(seen.y), person, sure))
         found.sort(key=lambda one: one[0])
-        self.choice = Choice.SEVERAL if len(found) > 1 and any(sure for _, _, sure in found) else Choice.NOBODY
+        self.choice = (
+            OperatorState.SEVERAL if len(found) > 1 and any(sure for _, _, sure in found) else OperatorState.NOBODY
+        )
         if not found or (len(found) > 1 and found[1][0] - found[0][0] < p.apart) or not found[0][2]:
             self._next = None
             return None
@@ -253,7 +255,7 @@ class OperatorChoice:
         if self._next is None or self._next[0] != person.id or not 0 <= now - self._next[1] <= p.memory:
             self._next = (person.id, now)
         if now - self._next[1] < p.settle:
-            self.choice = Choice.NOBODY
+            self.choice = OperatorState.NOBODY
             return None
         self.picked += 1
         self._next = None

@@ -11,7 +11,7 @@ from follow_plant import LAG
 from leg_scans import FIRST, LIMITS, STEP, feet, scan
 
 from skytether_services.follow_in_front.formation import Formation, FormationParams, State
-from skytether_services.follow_in_front.operator import Choice, OperatorChoice
+from skytether_services.follow_in_front.operator import OperatorChoice, OperatorState
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
 PERIOD = 0.1
@@ -57,7 +57,7 @@ def test_the_robot_stays_ahead_of_one_person_and_minds_no_other(round_trip: floa
         states.append(command.state)
         followed.append(operator)
     assert choice.picked == 1
-    assert choice.choice == Choice.FOLLOWED
+    assert choice.choice == OperatorState.FOLLOWED
     assert states[-1] == State.FOLLOWING
     assert min(distances) > 0.55
     assert np.abs(np.array(distances[100:]) - 0.9).max() < 0.15

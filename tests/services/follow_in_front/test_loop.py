@@ -17,7 +17,7 @@ from skytether_services.follow_in_front.camera_image import decode
 from skytether_services.follow_in_front.face_choice import choose
 from skytether_services.follow_in_front.face_tracker import FaceTracker
 from skytether_services.follow_in_front.formation import State
-from skytether_services.follow_in_front.operator import Choice
+from skytether_services.follow_in_front.operator import OperatorState
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +34,7 @@ def test_a_round_is_done_on_the_path_without_a_touch(seed: int, round_trip: floa
     assert 40 < loop.world.time - loop.begun < 65
     # One operator, followed all the time once they were picked, and seen where they are.
     assert loop.picked == 1
-    assert set(loop.choices[20:]) == {Choice.FOLLOWED}
+    assert set(loop.choices[20:]) == {OperatorState.FOLLOWED}
     assert set(loop.states[20:]) == {State.FOLLOWING}
     assert np.mean(loop.errors) < 0.08
     assert max(loop.errors) < 0.25

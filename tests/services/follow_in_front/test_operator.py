@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from skytether_services.follow_in_front.operator import Choice, OperatorChoice, OperatorParams
+from skytether_services.follow_in_front.operator import OperatorChoice, OperatorParams, OperatorState
 from skytether_services.follow_in_front.person import Person
 
 ORIGIN = (0.0, 0.0, 0.0)
@@ -33,14 +33,14 @@ def test_one_who_stands_behind_and_has_walked_is_picked() -> None:
     operator = choice.step([person(3, -1.0, 0.1)], ORIGIN, 0.0)
     assert operator is not None
     assert (operator.id, operator.x, operator.y) == (3, pytest.approx(-1.0), pytest.approx(0.1))
-    assert (choice.choice, choice.picked) == (Choice.FOLLOWED, 1)
+    assert (choice.choice, choice.picked) == (OperatorState.FOLLOWED, 1)
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.0, 0.0), (-0.2, 0.0), (-3.0, 0.0), (-1.0, 1.0)])
 def test_who_is_not_behind_or_too_near_or_too_far_is_not_picked(x: float, y: float) -> None:
     choice = OperatorChoice(AT_ONCE)
     assert choice.step([person(3, x, y)], ORIGIN, 0.0) is None
-    assert (choice.choice, choice.picked) == (Choice.NOBODY, 0)
+    assert (choice.choice, choice.picked) == (OperatorState.NOBODY, 0)
 
 
 def test_place_and_velocity_are_told_in_the_robots_frame() -> None:
@@ -64,7 +64,7 @@ def test_of_two_who_could_be_none_is_guessed() -> None:
     choice = OperatorChoice(AT_ONCE)
     left, right = person(1, -1.0, 0.3), person(2, -1.0, -0.3)
     assert choice.step([left, right], ORIGIN, 0.0) is None
-    assert choice.choice == Choice.SEVERAL
+    assert choice.choice == OperatorState.SEVERAL
     # One far off the line is no doubt.
     operator = choice.step([person(1, -1.0, 0.05), person(2, -1.2, -0.7)], ORIGIN, 0.1)
     assert operator is not None
@@ -80,7 +80,7 @@ def test_of_two_who_come_up_the_one_who_is_seen_to_walk_first_is_not_picked() ->
         assert choice.step([person(1, -1.0, 0.3), late], ORIGIN, 0.1 * scan) is None
     late.walks = True
     assert choice.step([person(1, -1.0, 0.3), late], ORIGIN, 0.3) is None
-    assert (choice.choice, choice.picked) == (Choice.SEVERAL, 0)
+    assert (choice.choice, choice.picked) == (OperatorState.SEVERAL, 0)
     for scan in range(4, 9):
         alone = choice.step([person(1, -1.0, 0.3)], ORIGIN, 0.1 * scan)
     assert alone is not None
@@ -91,7 +91,7 @@ def test_beside_one_who_may_be_about_to_walk_nobody_is_picked() -> None:
     moving.walks = False
     choice = OperatorChoice(AT_ONCE)
     assert choice.step([person(1, -1.0, 0.3), moving], ORIGIN, 0.0) is None
-    assert choice.choice == Choice.SEVERAL
+    assert choice.choice == OperatorState.SEVERAL
 
 
 def test_the_operator_stays_though_others_come_nearer() -> None:
@@ -112,7 +112,7 @@ def test_one_who_appears_beside_the_operator_may_be_the_operator() -> None:
     assert choice.step([something, other], ORIGIN, 0.1) is not None, "it may be a chair"
     something.walks = True
     assert choice.step([something, other], ORIGIN, 0.2) is None
-    assert choice.choice == Choice.SEVERAL
+    assert choice.choice == OperatorState.SEVERAL
     assert choice.step([other], ORIGIN, 2.1) is None
     assert choice.step([other], ORIGIN, 2.3) is not None
     assert choice.picked == 2
@@ -122,7 +122,7 @@ def test_one_who_is_lost_is_found_again_where_they_would_be() -> None:
     choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0, velocity=(0.4, 0.0))], ORIGIN, 0.0)
     assert choice.step([], ORIGIN, 0.5) is None
-    assert choice.choice == Choice.LOST
+    assert choice.choice == OperatorState.LOST
     # After 1 s at 0.4 m/s they are at -0.6; the track has a new number.
     operator = choice.step([person(5, -0.65, 0.1)], ORIGIN, 1.0)
     assert operator is not None
@@ -136,7 +136,7 @@ def test_nobody_takes_the_place_of_one_who_is_lost_at_once() -> None:
     stranger = person(2, -0.8, 0.1)  # 0.7 m from where the operator was
     for at in (0.1, 1.0, 2.0):
         assert choice.step([stranger], ORIGIN, at) is None
-        assert choice.choice == Choice.LOST
+        assert choice.choice == OperatorState.LOST
     assert choice.step([stranger], ORIGIN, 2.1) is not None
     assert choice.picked == 2, "another one, and it is counted"
 
@@ -145,21 +145,21 @@ def test_of_two_who_might_be_the_lost_one_none_is_guessed() -> None:
     choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 0.0)
     assert choice.step([person(2, -1.0, 0.3), person(3, -1.0, -0.3)], ORIGIN, 0.5) is None
-    assert choice.choice == Choice.LOST
+    assert choice.choice == OperatorState.LOST
 
 
 def test_one_who_walks_away_is_not_followed() -> None:
     choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 0.0)
     assert choice.step([person(1, -3.6, 0.0)], ORIGIN, 0.1) is None
-    assert choice.choice == Choice.LOST
+    assert choice.choice == OperatorState.LOST
     assert choice.step([person(1, -3.6, 0.0)], ORIGIN, 2.5) is None
-    assert choice.choice == Choice.NOBODY
+    assert choice.choice == OperatorState.NOBODY
 
 
 def test_a_clock_that_was_set_back_makes_nobody_lost_for_ever() -> None:
     choice = OperatorChoice(AT_ONCE)
     choice.step([person(1, -1.0, 0.0)], ORIGIN, 1000.0)
     choice.step([], ORIGIN, 1.0)
-    assert choice.choice == Choice.NOBODY
+    assert choice.choice == OperatorState.NOBODY
     assert choice.step([person(2, -1.0, 0.0)], ORIGIN, 1.1) is not None

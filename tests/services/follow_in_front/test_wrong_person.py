@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from leg_scans import FIRST, LIMITS, STEP, Place, feet, scan
 
-from skytether_services.follow_in_front.operator import Choice, OperatorChoice
+from skytether_services.follow_in_front.operator import OperatorChoice, OperatorState
 from skytether_services.follow_in_front.tracker import PeopleTracker
 
 PERIOD, SPEED = 0.1, 0.4
@@ -46,7 +46,7 @@ class Feet:
 class Seen(NamedTuple):
     """After one scan: how the choice stands, how many were picked, and how far who is followed is from both [m]."""
 
-    choice: Choice
+    choice: OperatorState
     picked: int
     from_operator: float
     from_stranger: float
@@ -159,10 +159,10 @@ def test_who_was_seen_beside_the_operator_is_not_the_operator_who_is_gone() -> N
 
     found = meet(operator, lambda t: (-1.0, 0.55 + 0.8 * max(MEET - t, 0.0)), 8.0)
     check(found)
-    assert any(seen.choice is not Choice.FOLLOWED for seen in found[round(MEET / PERIOD) :])
+    assert any(seen.choice is not OperatorState.FOLLOWED for seen in found[round(MEET / PERIOD) :])
 
 
 def test_one_who_walks_beside_the_operator_at_arms_length_disturbs_nobody() -> None:
     found = meet(behind(1.0), lambda t: (-1.0, 0.75 + 0.3 * max(MEET - t, 0.0)), 10.0)
-    assert all(seen.choice is Choice.FOLLOWED and seen.from_operator < 0.25 for seen in found[30:])
+    assert all(seen.choice is OperatorState.FOLLOWED and seen.from_operator < 0.25 for seen in found[30:])
     assert found[-1].picked == 1
