@@ -8,8 +8,8 @@ decides, and sends; the kernel stamps what it sends, and in between the process 
 tolerance is the same for every stretch of up to `_STRETCH_S`, not for every message, so that it cannot add up.
 
 On a graph nobody knows when a message was sent, only when this process took it, and a process that was held up takes
-many at once: they were sent at some time since it looked before (`SentVelocity.earliest`). What is possible by some of these
-times is no violation: it would be one of whoever held up the judge.
+many at once: they were sent at some time since it looked before (`SentVelocity.earliest`). What is possible by some of
+these times is no violation: it would be one of whoever held up the judge.
 """
 
 from __future__ import annotations
