@@ -8,6 +8,8 @@ READY := .venv/.ready
 export PYTHONDONTWRITEBYTECODE :=
 
 UNIT := $(BIN)/pytest -m "not slow"
+# One more than there are cores: a third of the quick tests' time is waiting.
+BY := -n $$(($$(nproc) + 1)) --dist loadfile
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
 .PHONY: demo test slow-engine slow-others slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit ros2 lock clean
@@ -16,7 +18,7 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
-	$(UNIT) -n 2 --dist loadfile
+	$(UNIT) $(BY)
 	@echo "Slow tests that bear company, in three rows side by side, one of them on a cluster; each row is shown when it is done ..."
 	@export SKYTETHER_TEST_IMAGES=skytether-test-$$$$/; trap '.ci/remove-images "$$SKYTETHER_TEST_IMAGES"' EXIT; trap 'exit 130' INT TERM; \
 		failed=0; $(MAKE) --no-print-directory --jobs 3 --keep-going --output-sync slow-engine slow-others slow-kubernetes || failed=1; \
@@ -32,11 +34,11 @@ slow-others: $(READY)
 	$(SLOW) and together and not first_row and not kubernetes"
 
 unit: $(READY) ## the quick part, under a minute
-	$(UNIT) -n 2 --dist loadfile
+	$(UNIT) $(BY)
 
 coverage: $(READY) ## the quick tests, and what share of each package they run; takes two to three times as long
 	@mkdir -p build/coverage
-	$(UNIT) -n 2 --dist loadfile --cov --cov-report json:build/coverage/files.json || echo "Tests failed: those that judge moments may, beside what counts."
+	$(UNIT) $(BY) --cov --cov-report json:build/coverage/files.json || echo "Tests failed: those that judge moments may, beside what counts."
 	@$(BIN)/python .ci/coverage.py < build/coverage/files.json
 
 images: $(READY) ## the container images, on the Docker engine of this machine; prints build time and size of each

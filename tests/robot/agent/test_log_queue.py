@@ -85,11 +85,12 @@ def test_a_handler_that_fails_does_not_end_the_log(reader, monkeypatch):
 
 def test_who_never_reads_is_left_behind(reader, monkeypatch):
     monkeypatch.setattr(log_queue, "_DRAIN_S", 0.1)
+    before = threading.enumerate()
     lines = LogQueue(2)
     lines.use()
     for _ in range(10):
         LOG.warning("unread")
-    (thread,) = (thread for thread in threading.enumerate() if thread.name == "log")
+    (thread,) = (thread for thread in threading.enumerate() if thread.name == "log" and thread not in before)
     lines.done()
     assert reader.lines == []
     reader.reads.set()

@@ -6,8 +6,7 @@ from math import nan
 
 import pytest
 
-from skytether.api.manifest import LinkRequirements as ServiceNeeds
-from skytether.api.manifest import TopicSpec
+from skytether.api.manifest import Needs, TopicSpec
 from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
 from skytether.robot.control.arbiter import LinkRequirements, Reason
@@ -454,7 +453,7 @@ HOUR_MS = 3_600_000.0
 def test_no_answer_of_the_orchestrator_lets_an_old_command_drive(driven, asked):
     """Every number of a session that reaches the control loop, as wide as it can be."""
     row = TopicSpec(name="cmd_vel", type=Twist.TYPE, direction="out", period_ms=HOUR_MS - 1, lifespan_ms=HOUR_MS)
-    held_to = terms(ServiceNeeds(max_rtt_ms=asked, max_loss=1.0), [row], "cmd_vel")
+    held_to = terms(Needs(max_rtt_ms=asked, max_loss=1.0), [row], "cmd_vel")
     driven.driver.hold_to(held_to)
     # The robot's own: 1 s of round trip, and the time that a command may be repeated.
     status = driven.run(0.5, linear=0.2, delay=3600.0)
@@ -467,7 +466,7 @@ def test_no_answer_of_the_orchestrator_lets_an_old_command_drive(driven, asked):
 
 def test_commands_stop_driving_after_the_robot_s_own_gap_whatever_period_a_manifest_has(driven):
     row = TopicSpec(name="cmd_vel", type=Twist.TYPE, direction="out", period_ms=HOUR_MS - 1)
-    driven.driver.hold_to(terms(ServiceNeeds(), [row], "cmd_vel"))
+    driven.driver.hold_to(terms(Needs(), [row], "cmd_vel"))
     driven.run(1.5, linear=0.2)
     status = driven.run(0.4)
     assert status.transitions[-1].reason is Reason.NO_COMMAND

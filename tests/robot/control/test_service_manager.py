@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.api.manifest import LinkRequirements as ServiceNeeds
-from skytether.api.manifest import TopicSpec
+from skytether.api.manifest import Needs, TopicSpec
 from skytether.robot.control.arbiter import LinkRequirements, LinkState, Reason
 from skytether.robot.control.service_manager import ServiceManager, Terms, explain, terms, tighten
 from skytether.robot.session.link_quality import LinkMonitor, Quality
@@ -16,9 +15,9 @@ CMD_VEL = TopicSpec(name="cmd_vel", type="geometry_msgs/msg/Twist", direction="o
 
 
 def test_terms_are_read_from_the_manifest():
-    asked = ServiceNeeds(max_rtt_ms=100, max_loss=0.05)
+    asked = Needs(max_rtt_ms=100, max_loss=0.05)
     assert terms(asked, [CMD_VEL], "cmd_vel") == Terms(0.1, 0.05, 0.05, 0.05)
-    assert terms(ServiceNeeds(), [CMD_VEL], "other") == Terms(None, None, 0.5, None)
+    assert terms(Needs(), [CMD_VEL], "other") == Terms(None, None, 0.5, None)
 
 
 def stats(delivered: int, offered: int = 0, expired: int = 0) -> SessionStats:
