@@ -19,13 +19,12 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from .folder import trusted
-from .protocol import REASON_BYTES, cut
+from .protocol import FIRST_ACT, REASON_BYTES, cut
 
 SIZE = 512
 """Bytes of the file: one block, written in place, which needs no room on a full disk."""
 _STOPPED, _RELEASED, _END = "stopped", "released", b"\nend\n"
 _BOOT_BYTES = 64
-FIRST_ACT = "nobody has reset the robot since the machine was started"
 _AGAIN = " (before the guard was started again)"
 LATCH_FILE = "latch"
 """In the folder of the sockets."""

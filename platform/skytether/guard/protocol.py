@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 from .velocity import STANDSTILL, Velocity
 
+FIRST_ACT = "nobody has reset the robot since the machine was started"
+"""Why a robot stands that nobody stopped."""
 REASON_BYTES = 200
 """Of a reason; the rest is cut off."""
 LARGEST = 512

@@ -19,8 +19,9 @@ from pathlib import Path
 
 from skytether.api.config_file import ConfigError
 from skytether.guard.claim import guarded
-from skytether.guard.estop import FIRST_ACT, LATCH_FILE
+from skytether.guard.estop import LATCH_FILE
 from skytether.guard.folder import objection
+from skytether.guard.protocol import FIRST_ACT
 from skytether.guard.record import lost_at_reboot
 from skytether.robot.config.gate_config import load_safety
 from skytether.robot.safety.client import GateError, ask, listens

@@ -13,7 +13,8 @@ from typing import IO
 from skytether.guard.claim import LOCK_FILE
 from skytether.guard.clock import now as boottime
 from skytether.guard.enable import Line, open_line
-from skytether.guard.estop import FIRST_ACT, LATCH_FILE, EstopFile, boot_id, lasting_file
+from skytether.guard.estop import LATCH_FILE, EstopFile, boot_id, lasting_file
+from skytether.guard.protocol import FIRST_ACT
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.messages import Bool
 

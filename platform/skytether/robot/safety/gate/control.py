@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from skytether.guard.estop import FIRST_ACT, EstopFile, clean
+from skytether.guard.estop import EstopFile, clean
+from skytether.guard.protocol import FIRST_ACT
 from skytether.guard.requests import Reply
 
 from ..rules.rules import Gate

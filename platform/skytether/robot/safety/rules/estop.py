@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import isfinite, isinf, isnan, nan
 
-from skytether.guard.estop import FIRST_ACT
+from skytether.guard.protocol import FIRST_ACT
 
 SETTLES_S = 0.1
 """After a time in which the gate stood still, what waited meanwhile comes within this long."""
