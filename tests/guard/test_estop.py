@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.guard.estop import FIRST_ACT, SIZE, EstopFile, KeptEstop, clean, decode, encode, lasting_file
+from skytether.guard.estop import SIZE, EstopFile, KeptEstop, clean, decode, encode, lasting_file
+from skytether.guard.protocol import FIRST_ACT
 
 BOOT = "7f0c"
 

@@ -7,7 +7,7 @@ import pytest
 
 from skytether.cli.commands.robot import gate_process
 from skytether.cli.commands.robot.gate_process import FoundGate, OwnGate
-from skytether.guard.estop import FIRST_ACT
+from skytether.guard.protocol import FIRST_ACT
 from skytether.robot.safety.client import GateError
 
 
