@@ -1,7 +1,5 @@
 """A machine joins, and a robot is driven from there, on this machine's real engine; nothing is left of it."""
 
-import subprocess
-
 import pytest
 from docker_site import Images
 
@@ -17,5 +15,4 @@ def test_from_an_engine_to_the_first_command_each_step_has_its_row(docker_images
     assert steps == ["invite", *["join"] * 6, "run", "robot", "all"]
     assert all(row.took_s >= 0 for row in rows)
     assert rows[-1].took_s == pytest.approx(sum(row.took_s for row in rows if row.step in began), abs=0.01)
-    left = ["docker", "ps", "-aq", "--filter", f"ancestor={docker_images.name('virtual-trail')}"]
-    assert subprocess.run(left, capture_output=True, text=True, check=True).stdout == ""
+    assert docker_images.containers("virtual-trail") == []

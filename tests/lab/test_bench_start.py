@@ -22,11 +22,10 @@ def test_a_runtime_that_is_none_is_refused():
 @pytest.mark.slow
 @pytest.mark.docker
 def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_left(docker_images: Images):
-    of_the_image = ("--filter", f"ancestor={docker_images.name('virtual-trail')}")
     owners: set[str] = set()
 
     def on_start(row: str, seconds: float) -> None:
-        owners.update(docker("ps", "-a", "--format", '{{.Label "skytether.io/owner"}}', *of_the_image))
+        owners.update(docker_images.containers("virtual-trail", "skytether.io/owner"))
 
     rows = bench_start(1, ["docker"], docker_images.prefix, on_start)
     # How fast it is, the benchmark says where it is run for that; here a busy machine may take its time.
@@ -36,7 +35,7 @@ def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_l
         ("docker", 1, 1),
     ]
     assert all(0 < row.p50_s == row.p99_s for row in rows)
-    assert docker("ps", "-aq", *of_the_image) == []
+    assert docker_images.containers("virtual-trail") == []
     (owner,) = owners
     assert owner.startswith("bench-")
     assert docker("network", "ls", "-q", "--filter", f"name={owner}") == []

@@ -44,6 +44,13 @@ class Images:
     def name(self, image: str) -> str:
         return f"{self.prefix}{image}:1"
 
+    def containers(self, image: str, label: str = "") -> list[str]:
+        """Of an image, by their ids, or what a label says where they have it; pods of a cluster here are not ours."""
+        shown = f'{{{{.Label "{label}"}}}}' if label else "{{.ID}}"
+        pods = '{{if not (.Label "io.kubernetes.pod.name")}}' + shown + "{{end}}"
+        command = ["docker", "ps", "-a", "--filter", f"ancestor={self.name(image)}", "--format", pods]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
     @contextmanager
     def another(self, image: str) -> Iterator[str]:
         """The name of one that few tests need, as long as it is there; what all tests have stays."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from typing import Annotated
 
 import typer
 
 from skytether.bridge.echo import EchoServer
 
+from ..end_signal import EndSignal
 from ..output import console, fail
 
 
@@ -21,12 +20,10 @@ def echo(
 
     Robots name it in robot.yaml under task.echoes, by site; `skytether doctor` uses it to look at the network.
     """
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+    end = EndSignal()
     try:
         with EchoServer(host, port) as server:
             console.print(f"echo on UDP {server.address[0]}:{server.address[1]}", markup=False)
-            stopped.wait()
+            end.wait()
     except OSError as error:
         fail(f"cannot listen on UDP {host}:{port}: {error.strerror}; give another with --host or --port")

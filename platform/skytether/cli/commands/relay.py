@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import signal
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +15,7 @@ from skytether.bridge.relay import Relay, show_address
 from skytether.bridge.relay_config import RelayConfig, parse_endpoint
 from skytether.orchestrator.runtimes.base import RuntimeFailure
 
+from ..end_signal import EndSignal
 from ..output import console, fail, print_json
 
 if TYPE_CHECKING:
@@ -78,10 +77,7 @@ def _endpoint(address: tuple[str, int]) -> dict[str, Any]:
 
 
 def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None:
-
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+    end = EndSignal()
     here = Relay((settings.listen.host, settings.listen.port), limits=settings.bounds)
     try:
         here.start()
@@ -95,8 +91,8 @@ def _run(settings: RelayConfig, seconds: float | None, *, as_json: bool) -> None
     start = time.monotonic()
     before = ""
     try:
-        while not stopped.is_set() and (left := _left(start, seconds)) > 0:
-            stopped.wait(min(1.0, left))
+        while not end.came and (left := _left(start, seconds)) > 0:
+            end.wait(min(1.0, left))
             stats = here.stats()
             if as_json:
                 print_json({"seconds": round(time.monotonic() - start, 3), **dataclasses.asdict(stats)})

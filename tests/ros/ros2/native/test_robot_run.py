@@ -240,7 +240,7 @@ def test_the_check_waits_for_a_graph_that_is_discovered_after_ten_seconds(ros2_n
     late = far_nodes.start(f"DOMAIN = {ros2_nodes.domain}\n{LATE}")
     process = skytether("robot", "run", str(config), "--check")
     until(programs, "our node to begin")
-    time.sleep(10.5)  # what this is about; it joins a second after it begins, and then waits for 12
+    time.sleep(10.5)  # what this is about; it joins a second after it begins, and then waits for 15
     assert process.poll() is None
     late.tell("come")
     found, said = process.communicate(timeout=60)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import signal
-import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,6 +19,7 @@ from skytether.api.config_file import ConfigError
 from skytether.bridge.endpoint import BridgeError
 from skytether.ros.notes import NOTES
 
+from ...end_signal import EndSignal
 from ...output import console, fail, print_json
 from .config import load_config, load_key, write_new_key
 from .ends import start_ends
@@ -61,10 +60,7 @@ def bridge(
 
 
 def _run(settings: BridgeConfig, key: bytes, folder: Path, seconds: float | None, *, as_json: bool) -> None:
-
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+    signalled = EndSignal()
     with ExitStack() as stack:
         try:
             ends = start_ends(settings, key, stack, folder)
@@ -79,9 +75,9 @@ def _run(settings: BridgeConfig, key: bytes, folder: Path, seconds: float | None
         live = None if as_json else stack.enter_context(Live(console=console, auto_refresh=False))
         start = time.monotonic()
         elapsed = 0.0
-        while not stopped.is_set() and (seconds is None or elapsed < seconds):
+        while not signalled.came and (seconds is None or elapsed < seconds):
             until = math.floor(elapsed) + 1 if seconds is None else min(math.floor(elapsed) + 1, seconds)
-            stopped.wait(max(0.0, start + until - time.monotonic()))
+            signalled.wait(max(0.0, start + until - time.monotonic()))
             elapsed = time.monotonic() - start
             shown = [(end.role, end.bridge.stats()) for end in ends]
             if live is not None:

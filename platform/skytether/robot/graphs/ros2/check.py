@@ -28,7 +28,7 @@ _JOIN_S = 10.0
 """For the node to come up, or the router to answer and to tell of the graph."""
 _LIFECYCLE_S = 3.0
 """For lifecycle nodes to tell their states."""
-_FIRST_S = 12.0
+_FIRST_S = 15.0
 """For the first node on DDS to be discovered."""
 _NEXT_S = 5.0
 """For the next: nobody says when all of them are."""

@@ -32,7 +32,7 @@ from .side.outbox import Sender
 
 SILENT_S = 5.0
 """Without a sign of life of the program, which gives one each half second: then it hangs, and is ended."""
-ALONE_S = 15.0
+ALONE_S = 20.0
 """Without any other node in the graph: then that is said. ``--check`` waits for less."""
 NOBODY = (
     "no other node is seen: do they have the same ROS_DOMAIN_ID and RMW_IMPLEMENTATION, and may they be "
