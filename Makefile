@@ -19,10 +19,11 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) $(BY)
-	@echo "Slow tests that bear company, in three rows side by side, one of them on a cluster; each row is shown when it is done ..."
+	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
 	@export SKYTETHER_TEST_IMAGES=skytether-test-$$$$/; trap '.ci/remove-images "$$SKYTETHER_TEST_IMAGES"' EXIT; trap 'exit 130' INT TERM; \
-		failed=0; $(MAKE) --no-print-directory --jobs 3 --keep-going --output-sync slow-engine slow-others slow-kubernetes || failed=1; \
-		echo "The other slow tests, one at a time ..."; $(SLOW) and not together and not kubernetes" || failed=1; exit $$failed
+		failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine slow-others || failed=1; \
+		echo "The other slow tests, one at a time ..."; $(SLOW) and not together and not kubernetes" || failed=1; \
+		echo "A cluster, for the tests that need one ..."; $(MAKE) --no-print-directory slow-kubernetes || failed=1; exit $$failed
 
 slow-engine: $(READY)
 	$(SLOW) and together and first_row and not kubernetes"

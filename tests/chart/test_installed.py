@@ -117,7 +117,8 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
 
         first.uninstall()
         assert first.left() == []
-        assert robots[1].get_instance(held[1].id).state == "running"
+        beside = robots[1].get_instance(held[1].id)
+        assert beside.state == "running", beside
         assert second.pods("skytether.io/owner=demo-cluster"), "what belongs to the other is still there"
         second.uninstall()
         assert second.left() == []
