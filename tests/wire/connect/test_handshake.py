@@ -2,6 +2,7 @@
 
 import pytest
 from deep_size import deep_size
+from link_look import events, hellos, rejected, welcomes
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Role, Session, Topic
@@ -10,22 +11,6 @@ from skytether.wire.connect.handshake import NO_KEYS, HandshakeResponder, Hello
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 IN = Direction.IN
-
-
-def events(link, role, kind):
-    return [(t, e) for t, e in link.events[role] if isinstance(e, kind)]
-
-
-def rejected(link, role):
-    return link.sessions[role].stats(link.time_of(role)).rejected
-
-
-def hellos(link):
-    return [p for _, p in link.sent[ROBOT] if p[0] == packet.HELLO]
-
-
-def welcomes(link):
-    return [p for _, p in link.sent[SERVICE] if p[0] == packet.WELCOME]
 
 
 def test_one_round_trip(world, topics):

@@ -1,6 +1,7 @@
 """The conversation around a handshake: what is answered, to whom, how often, and what is told of it."""
 
 import pytest
+from link_look import events, rejected, welcomes
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Config, Connected, Direction, Refused, Role, Topic
@@ -11,18 +12,6 @@ from skytether.wire.connect.handshake_driver import MAX_RAW
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 IN = Direction.IN
-
-
-def events(link, role, kind):
-    return [(t, e) for t, e in link.events[role] if isinstance(e, kind)]
-
-
-def rejected(link, role):
-    return link.sessions[role].stats(link.time_of(role)).rejected
-
-
-def welcomes(link):
-    return [p for _, p in link.sent[SERVICE] if p[0] == packet.WELCOME]
 
 
 def test_nobody_answers_what_is_not_for_him(world):

@@ -3,10 +3,10 @@
 import itertools
 
 import pytest
+from link_look import events, hellos
 
 from skytether.emulator.link_model import LinkConditions
 from skytether.wire import Connected, Disconnected, Role
-from skytether.wire.codec import packet
 
 ROBOT, SERVICE = Role.ROBOT, Role.SERVICE
 
@@ -15,14 +15,6 @@ def relay(link, first):
     first.handle_timer(link.now)
     for batch in first.transmit(link.now):
         link.inject(ROBOT, bytes(batch.data), "service", batch.segment)
-
-
-def events(link, role, kind):
-    return [(t, e) for t, e in link.events[role] if isinstance(e, kind)]
-
-
-def hellos(link):
-    return [p for _, p in link.sent[ROBOT] if p[0] == packet.HELLO]
 
 
 def test_a_lost_handshake_is_repeated_quickly_at_first_and_with_back_off_later(world):
