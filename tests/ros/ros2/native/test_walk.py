@@ -18,6 +18,7 @@ from skytether.lab.trail import THESIS_TRAIL
 __all__ = ["ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2, pytest.mark.usefixtures("netns")]
 
+STANDS_S = 2.0
 WALK_S = 180.0
 SENSORS = {"force": "geometry_msgs/msg/WrenchStamped", "wheels": "sensor_msgs/msg/JointState"}
 SENSORS |= {"odom": "nav_msgs/msg/Odometry"}
@@ -89,9 +90,13 @@ class Walk:
 
     def stood(self):
         """Wait until the wheels are told to stand; returns when that was [ns]."""
-        until(lambda: not self.agent.drives, "the loss to be seen")
-        until(lambda: self.walker.stands, "the robot to stand")
+        # A busy machine may have stopped it a moment before the loss did, and it goes on a second after such a stop.
+        until(lambda: not self.agent.drives and self.walker.stands and self._stands_for_s() > STANDS_S, "it to stand")
         return self.walker.told()[-1][0]
+
+    def _stands_for_s(self):
+        moved = max(at for at, x, z in self.walker.told() if (x, z) != (0.0, 0.0))
+        return (time.time_ns() - moved) / 1e9
 
     def assert_stood(self, since, until_ns):
         """All that the wheels were told between two times [ns] is to stand."""
@@ -131,8 +136,8 @@ def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, ros2_nodes):
     walk.walker.walk()
     walk.finish()
     counts, result = walk.agent.counts, walk.walker.result()
-    assert result.kte_m < 0.1, walk.agent.log  # 16 mm; more on a machine that has no time for the commands
-    assert result.deviation_max_m < 0.3
+    assert result.kte_m < 0.05, walk.agent.log
+    assert result.deviation_max_m < 0.15
     assert sum(c.lost for c in scene.link.counters().values()) > 50
     assert set(counts) == {*SENSORS, "cmd_vel"}
     for topic, outcomes in counts.items():
@@ -198,7 +203,7 @@ def test_each_part_of_one_robot_is_killed_beside_another_and_both_walks_are_fini
     walk.finish()
     other.finish()
     other.assert_all_delivered_was_heard()
-    assert max(other.walker.result().kte_m, walker.result().kte_m) < 0.1, agent.log
+    assert max(other.walker.result().kte_m, walker.result().kte_m) < 0.05, agent.log
     for topic in SENSORS:
         published, heard = walker.diary.stamps(topic), walk.service.stamps(topic)
         assert len(set(heard)) == len(heard), topic
