@@ -303,9 +303,10 @@ def test_gate_and_agent_are_nodes_of_one_namespace(launched, ros2_nodes):
     until(lambda: "skytether_gate" in listener.nodes()[1], "the gate to have the wheels")
     agent = launched.start("robot_run", "robot_launch", "-r", wheels, use_sim_time=True)
     listener.status("fleet/one/skytether: gate", lambda status: status.message != "does not answer")
-    found = set(listener.nodes()[0])
     ours = [f"/fleet/one/skytether{role}" for role in ("", "_guard", "_gate")]
-    assert set(ours) <= found
+    # A node's name is discovered after what it publishes.
+    until(lambda: set(ours) <= set(listener.nodes()[0]), "the three nodes")
+    found = set(listener.nodes()[0])
     for node in ours:
         assert listener.parameters(node, "use_sim_time")["use_sim_time"][-1][-1] is True, node
     assert all(name.startswith("/fleet/one/") for name in found - {"/listener"})

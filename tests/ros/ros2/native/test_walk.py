@@ -5,6 +5,7 @@ domain. Both ends' nodes keep diaries, so that what the bridge says it delivered
 """
 
 import time
+from collections import Counter
 
 import psutil
 import pytest
@@ -140,9 +141,11 @@ def test_a_walker_of_rclpy_is_guided_along_the_trail(scene, ros2_nodes):
     assert result.deviation_max_m < 0.15
     assert sum(c.lost for c in scene.link.counters().values()) > 50
     assert set(counts) == {*SENSORS, "cmd_vel"}
-    for topic, outcomes in counts.items():
-        assert outcomes["lost"] - outcomes["late"] <= 0.001 * outcomes["sent"], topic
-        assert outcomes["unknown"] == 0, topic
+    # The share that a row may lose is of all its messages: of so few, a row alone tells nothing.
+    sensors = sum((counts[topic] for topic in SENSORS), Counter())
+    for outcomes in (sensors, counts["cmd_vel"]):
+        assert outcomes["lost"] - outcomes["late"] <= 0.001 * outcomes["sent"], counts
+    assert not any(outcomes["unknown"] for outcomes in counts.values()), counts
     for topic in SENSORS:
         published = len(walk.walker.diary.stamps(topic))
         assert 0.98 * published <= walk.agent.taken[topic] <= published, topic
