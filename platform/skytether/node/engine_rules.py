@@ -69,6 +69,7 @@ _CALLS = tuple(
         ("DELETE", r"/volumes/(skytether-[A-Za-z0-9_.-]+|[0-9a-f]{64})", "volume", "force"),
     )
 )
+_WITH_BODY = {"create", "update", "network made", "joined", "volume made"}
 _LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
 _CONTAINER = {"Image", "Healthcheck", "User", "Env", "ExposedPorts", "Labels", "HostConfig", "Entrypoint", "Cmd"}
 _HOST = _LIMITS | {
@@ -116,6 +117,8 @@ Subject = tuple[str, str]
 there and ours: in these a guard has a right that others in there feel. ``guarded`` is a container that is in such ones
 alone. ``images`` must not be there, or be from where they are pulled; ``pulled`` must be from a registry that may be
 asked."""
+_Judgement = tuple[str | None, tuple[Subject, ...]]
+"""As `judge` gives it."""
 
 
 def judge(call: Call, devices: Iterable[str] = ()) -> tuple[str | None, tuple[Subject, ...]]:
@@ -139,64 +142,88 @@ def plain(path: str) -> str:
     return _BEFORE.sub("", path)
 
 
-def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> tuple[str | None, tuple[Subject, ...]]:
-    body, expects = call.body, kind in ("create", "update", "network made", "joined", "volume made")
+def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> _Judgement:
+    body, expects = call.body, kind in _WITH_BODY
     if expects and not isinstance(body, dict):
         return "the call wants an object", ()
     if body is not None and not expects:
         return "the call has a body", ()
     match kind:
         case "create":
-            host = _at(body, "HostConfig")
-            network = _text(host, "NetworkMode")
-            within = network.partition("container:")[2]
-            volumes = [one.get("Source") for one in _list(host, "Mounts") if isinstance(one, dict)]
-            name = call.query.get("name", _OURS)
-            odd = None if name.startswith(_OURS) else f"it is named '{name[:80]}', and ours begin with {_OURS}"
-            return odd or _container(body, set(devices)), (
-                ("containers", within) if within else ("joined networks", network),
-                *((("guarded", within),) if within and host.get("CapAdd") else ()),
-                *(("volumes", str(volume)) for volume in volumes if volume),
-            )
+            return _created(call, devices)
         case "update":
             return _only(body, _LIMITS, "limits"), (("containers", name),)
         case "joined":
-            settings = {key: one for key, one in _at(body, "EndpointConfig").items() if one}
-            refused = _only(body, {"Container", "EndpointConfig", "Force"}, "the call") or _only(settings, set(), "it")
-            container = _text(body, "Container")
-            if not re.fullmatch(_CONTAINER_ID, container):
-                return "a container is named by its whole id", ()
-            return refused or _network_name(name), (("containers", container), ("kept networks", name))
+            return _joined(name, body)
         case "network made":
             return _network(body), ()
         case "volume made":
             return _volume(body), ()
         case "prune":
-            filters = _json(call.query.get("filters", ""))
-            ours = isinstance(filters, dict) and filters.get("label") in ([OLD_GUARD], {OLD_GUARD: True})
-            return None if ours else "only what earlier releases left is pruned", ()
+            return _pruned(call), ()
         case "pull":
-            image, tag = call.query.get("fromImage", ""), call.query.get("tag", "")
-            if re.fullmatch(_IMAGE, image) and re.fullmatch(_DIGEST, tag):
-                return None, (("pulled", image),)  # by that nothing gets another name
-            odd = None if re.fullmatch(_IMAGE, image) and re.fullmatch(_TAG, tag) else "a pull names one image"
-            return odd, (("pulled", image), ("images", f"{image}:{tag}"))
+            return _pulled(call)
         case "listed":
-            filters = _json(call.query.get("filters", ""))
-            labels = filters.get("label") if isinstance(filters, dict) else None
-            ours = isinstance(labels, list) and any(str(one).partition("=")[0] == OWNER for one in labels)
-            return None if ours else f"only what has the label {OWNER} is listed", ()
+            return _listed(call), ()
         case "network seen":
             return _network_name(name), (("seen networks", name),)
         case "network":
             return _network_name(name), (("networks", name),)
         case "archive":
-            path = call.query.get("path")
-            known = path == FOLDER if call.method == "PUT" else path in _READ
-            return None if known else f"{str(path)[:80]} is no file that a site asks for", (("containers", name),)
+            return _archive(call), (("containers", name),)
         case "container" | "volume":
             return None, ((f"{kind}s", name),)
     return None, ()
+
+
+def _created(call: Call, devices: Iterable[str]) -> _Judgement:
+    host = _at(call.body, "HostConfig")
+    network = _text(host, "NetworkMode")
+    within = network.partition("container:")[2]
+    volumes = [one.get("Source") for one in _list(host, "Mounts") if isinstance(one, dict)]
+    name = call.query.get("name", _OURS)
+    odd = None if name.startswith(_OURS) else f"it is named '{name[:80]}', and ours begin with {_OURS}"
+    return odd or _container(call.body, set(devices)), (
+        ("containers", within) if within else ("joined networks", network),
+        *((("guarded", within),) if within and host.get("CapAdd") else ()),
+        *(("volumes", str(volume)) for volume in volumes if volume),
+    )
+
+
+def _joined(network: str, body: Mapping[str, Any]) -> _Judgement:
+    settings = {key: one for key, one in _at(body, "EndpointConfig").items() if one}
+    refused = _only(body, {"Container", "EndpointConfig", "Force"}, "the call") or _only(settings, set(), "it")
+    container = _text(body, "Container")
+    if not re.fullmatch(_CONTAINER_ID, container):
+        return "a container is named by its whole id", ()
+    return refused or _network_name(network), (("containers", container), ("kept networks", network))
+
+
+def _pulled(call: Call) -> _Judgement:
+    image, tag = call.query.get("fromImage", ""), call.query.get("tag", "")
+    if re.fullmatch(_IMAGE, image) and re.fullmatch(_DIGEST, tag):
+        return None, (("pulled", image),)  # by that nothing gets another name
+    odd = None if re.fullmatch(_IMAGE, image) and re.fullmatch(_TAG, tag) else "a pull names one image"
+    return odd, (("pulled", image), ("images", f"{image}:{tag}"))
+
+
+def _pruned(call: Call) -> str | None:
+    filters = _json(call.query.get("filters", ""))
+    ours = isinstance(filters, dict) and filters.get("label") in ([OLD_GUARD], {OLD_GUARD: True})
+    return None if ours else "only what earlier releases left is pruned"
+
+
+def _listed(call: Call) -> str | None:
+    filters = _json(call.query.get("filters", ""))
+    labels = filters.get("label") if isinstance(filters, dict) else None
+    ours = isinstance(labels, list) and any(str(one).partition("=")[0] == OWNER for one in labels)
+    return None if ours else f"only what has the label {OWNER} is listed"
+
+
+def _archive(call: Call) -> str | None:
+    path = call.query.get("path")
+    known = path == FOLDER if call.method == "PUT" else path in _READ
+    return None if known else f"{str(path)[:80]} is no file that a site asks for"
 
 
 def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:

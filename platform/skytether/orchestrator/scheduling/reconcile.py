@@ -149,8 +149,7 @@ class Reconciler:
         # Before the look: nothing can be observed that is not in it.
         live = self._store.live_at(site.name, changing=not whole)
         if whole:
-            before = self._store.robots_at(site.name) if site.hosted is None else site.hosted
-            site.hosted = before | {record.robot for record in live}
+            self._note_hosted(site, live)
         due = whole and time.monotonic() - site.tidied_at >= _TIDY
         ids = {record.id for record in live}
         looked = self._look(site, ids, led, whole=whole, due=due)
@@ -176,6 +175,12 @@ class Reconciler:
             self._resizing.keep(site, live, looked, now)
         if due:
             self._tidy(site)
+        return self._until_next(site, live, actions, done, whole=whole)
+
+    def _until_next(
+        self, site: Site, live: Sequence[Record], actions: Sequence[Action], done: Sequence[Action], *, whole: bool
+    ) -> float:
+        """Seconds until the next pass, and what is looked at until then."""
         if site.balks:
             return self._timing.place  # it is not asked again and again what it does not do
         changing = {record.id for record in live if record.state in (State.STARTING, State.STOPPING)}
@@ -185,6 +190,10 @@ class Reconciler:
             if whole:
                 site.passed_at = site.watched_at = self._steady()
         return self._timing.observe_changing if actions or changing else self._timing.observe
+
+    def _note_hosted(self, site: Site, live: Iterable[Record]) -> None:
+        before = self._store.robots_at(site.name) if site.hosted is None else site.hosted
+        site.hosted = before | {record.robot for record in live}
 
     def _look(self, site: Site, ids: Set[str], led: int, *, whole: bool, due: bool) -> Mapping[str, Observation] | None:
         """What is at a site: all of it, or these only; None: it does not answer, and is noted as silent.

@@ -99,22 +99,12 @@ def pod(
         node_port: Of the Service by which it is reached; None: there is none.
         epoch: Of the leader; 0: there is none.
     """
-    spec, grant = launch.spec, launch.grant
-    name = name_of(owner, grant.instance, launch.attempt)
-    environment = {**options.environment, GRANT_VARIABLE: f"{_GRANT}/grant.json"}
-    reached = {"containerPort": INNER_PORT, "protocol": "UDP", **({"hostPort": port} if port is not None else {})}
-    aliases = [
-        {"ip": address, "hostnames": [opening.host]}
-        for opening, addresses in openings.items()
-        for address in addresses
-        if "/" not in address
-    ]
-    health = {"httpGet": {"path": "/healthz", "port": HEALTH_PORT}, "periodSeconds": 1, "timeoutSeconds": 1}
+    grant = launch.grant
     return {
         "apiVersion": "v1",
         "kind": "Pod",
         "metadata": {
-            "name": name,
+            "name": name_of(owner, grant.instance, launch.attempt),
             "labels": {
                 **options.labels,
                 **MANAGED,
@@ -145,58 +135,82 @@ def pod(
                 "fsGroup": USER,
                 "seccompProfile": {"type": "RuntimeDefault"},
             },
-            "dnsPolicy": "None",  # nobody to ask: names would be a way out
-            "dnsConfig": {"nameservers": ["127.0.0.1"]},
-            **({"hostAliases": aliases} if aliases else {}),
-            **({"nodeSelector": options.node_selector} if options.node_selector else {}),
-            **({"tolerations": list(options.tolerations)} if options.tolerations else {}),
-            **({"priorityClassName": options.priority_class} if options.priority_class else {}),
-            **(
-                {"imagePullSecrets": [{"name": secret} for secret in options.image_pull_secrets]}
-                if options.image_pull_secrets
-                else {}
-            ),
-            "topologySpreadConstraints": [
-                {
-                    "maxSkew": 1,
-                    "topologyKey": "kubernetes.io/hostname",
-                    "whenUnsatisfiable": "ScheduleAnyway",
-                    "labelSelector": {"matchLabels": {OWNER: owner}},
-                }
-            ],
-            "containers": [
-                {
-                    "name": "service",
-                    "image": spec.image,
-                    "imagePullPolicy": _PULL[options.pull if is_pulled(spec.image or "") else "never"],
-                    "env": [{"name": key, "value": value} for key, value in environment.items()],
-                    "ports": [reached],
-                    "resources": _resources(spec),
-                    "securityContext": {
-                        "allowPrivilegeEscalation": False,
-                        "readOnlyRootFilesystem": True,
-                        "capabilities": {"drop": ["ALL"]},
-                    },
-                    # Until its service is ready; how long that may take the orchestrator knows.
-                    "startupProbe": {**health, "failureThreshold": 1_000_000},
-                    "readinessProbe": {**health, "failureThreshold": 2},
-                    "terminationMessagePolicy": "FallbackToLogsOnError",
-                    "volumeMounts": [
-                        {"name": "grant", "mountPath": _GRANT, "readOnly": True},
-                        {"name": "own", "mountPath": _OWN},
-                        {"name": "data", "mountPath": _DATA},
-                        {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108 (the container's own)
-                    ],
-                }
-            ],
-            "volumes": [
-                {"name": "grant", "secret": {"secretName": name, "defaultMode": 0o440}},
-                {"name": "own", "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
-                _data(launch, options, owner),
-                {"name": "tmp", "emptyDir": {"medium": "Memory", "sizeLimit": "64Mi"}},
-            ],
+            **_names(openings),
+            **_scheduling(options, owner),
+            "containers": [_container(launch.spec, options, port)],
+            "volumes": _volumes(launch, options, owner),
         },
     }
+
+
+def _names(openings: Openings) -> dict[str, Any]:
+    """What a pod knows by name: what it may connect to, and nothing else."""
+    aliases = [
+        {"ip": address, "hostnames": [opening.host]}
+        for opening, addresses in openings.items()
+        for address in addresses
+        if "/" not in address
+    ]
+    return {
+        "dnsPolicy": "None",  # nobody to ask: names would be a way out
+        "dnsConfig": {"nameservers": ["127.0.0.1"]},
+        **({"hostAliases": aliases} if aliases else {}),
+    }
+
+
+def _scheduling(options: KubernetesOptions, owner: str) -> dict[str, Any]:
+    """On which nodes a site's pods may be, and what these need to get an image."""
+    given = {
+        "nodeSelector": options.node_selector,
+        "tolerations": list(options.tolerations),
+        "priorityClassName": options.priority_class,
+        "imagePullSecrets": [{"name": secret} for secret in options.image_pull_secrets],
+    }
+    spread = {
+        "maxSkew": 1,
+        "topologyKey": "kubernetes.io/hostname",
+        "whenUnsatisfiable": "ScheduleAnyway",
+        "labelSelector": {"matchLabels": {OWNER: owner}},
+    }
+    return {**{key: value for key, value in given.items() if value}, "topologySpreadConstraints": [spread]}
+
+
+def _container(spec: ServiceSpec, options: KubernetesOptions, port: int | None) -> dict[str, Any]:
+    environment = {**options.environment, GRANT_VARIABLE: f"{_GRANT}/grant.json"}
+    health = {"httpGet": {"path": "/healthz", "port": HEALTH_PORT}, "periodSeconds": 1, "timeoutSeconds": 1}
+    return {
+        "name": "service",
+        "image": spec.image,
+        "imagePullPolicy": _PULL[options.pull if is_pulled(spec.image or "") else "never"],
+        "env": [{"name": key, "value": value} for key, value in environment.items()],
+        "ports": [{"containerPort": INNER_PORT, "protocol": "UDP", **({"hostPort": port} if port is not None else {})}],
+        "resources": _resources(spec),
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+        # Until its service is ready; how long that may take the orchestrator knows.
+        "startupProbe": {**health, "failureThreshold": 1_000_000},
+        "readinessProbe": {**health, "failureThreshold": 2},
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+        "volumeMounts": [
+            {"name": "grant", "mountPath": _GRANT, "readOnly": True},
+            {"name": "own", "mountPath": _OWN},
+            {"name": "data", "mountPath": _DATA},
+            {"name": "tmp", "mountPath": "/tmp"},  # noqa: S108 (the container's own)
+        ],
+    }
+
+
+def _volumes(launch: Launch, options: KubernetesOptions, owner: str) -> list[dict[str, Any]]:
+    secret_name = name_of(owner, launch.grant.instance, launch.attempt)
+    return [
+        {"name": "grant", "secret": {"secretName": secret_name, "defaultMode": 0o440}},
+        {"name": "own", "emptyDir": {"medium": "Memory", "sizeLimit": "1Mi"}},
+        _data(launch, options, owner),
+        {"name": "tmp", "emptyDir": {"medium": "Memory", "sizeLimit": "64Mi"}},
+    ]
 
 
 def _data(launch: Launch, options: KubernetesOptions, owner: str) -> dict[str, Any]:

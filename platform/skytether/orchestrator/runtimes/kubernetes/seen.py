@@ -109,20 +109,13 @@ def parse(document: Document) -> PodState | None:
     if INSTANCE not in labels or not labels.get(ATTEMPT, "").isdecimal():
         return None
     container = spec["containers"][0]
-    told: Document = next(
-        (one for one in status.get("containerStatuses") or () if one["name"] == container["name"]), {}
-    )
+    told = _container_status(status, container["name"])
     state = told.get("state") or {}
     waiting, terminated = state.get("waiting") or {}, state.get("terminated") or {}
-    ports = [port["hostPort"] for port in container.get("ports") or () if port.get("hostPort")]
-    if notes.get(NODE_PORT, "").isdecimal():
-        ports = [int(notes[NODE_PORT])]
-    limits = (container.get("resources") or {}).get("limits") or {}
-    waits_for = _waits_for(status, waiting)
-    resources, (at_it, never) = pull_resources(container.get("resources") or {}), pull_progress(status)
-    claims = [one["persistentVolumeClaim"]["claimName"] for one in spec.get("volumes") or () if one.get(_CLAIM)]
-    if _CLAIM.lower() in waits_for.lower() and claims:
-        waits_for += f" ('kubectl describe pvc {claims[0]}' says why; site's option 'storage_class')"
+    waits_for = _waits_for(spec, status, waiting)
+    asked = container.get("resources") or {}
+    limits = asked.get("limits") or {}
+    resources, (at_it, never) = pull_resources(asked), pull_progress(status)
     return PodState(
         name=meta["name"],
         uid=meta["uid"],
@@ -145,7 +138,7 @@ def parse(document: Document) -> PodState | None:
         node=spec.get("nodeName", ""),
         host=status.get("hostIP", ""),
         address=status.get("podIP", ""),
-        host_port=ports[0] if ports else None,
+        host_port=_host_port(container, notes),
         session=notes.get(SESSION, ""),
         failure=notes.get(FAILURE, ""),
         stops=bool(spec.get("activeDeadlineSeconds")) or bool(meta.get("deletionTimestamp")),
@@ -157,14 +150,34 @@ def parse(document: Document) -> PodState | None:
     )
 
 
-def _waits_for(status: Document, waiting: Document) -> str:
+def _container_status(status: Document, name: str) -> Document:
+    return next((one for one in status.get("containerStatuses") or () if one["name"] == name), {})
+
+
+def _host_port(container: Document, notes: Document) -> int | None:
+    """That of its instance's Service comes first."""
+    if notes.get(NODE_PORT, "").isdecimal():
+        return int(notes[NODE_PORT])
+    return next((port["hostPort"] for port in container.get("ports") or () if port.get("hostPort")), None)
+
+
+def _waits_for(spec: Document, status: Document, waiting: Document) -> str:
+    waits_for = _unscheduled(status)
+    if waits_for is None:
+        reason = str(waiting.get("reason", ""))
+        usual = reason in ("ContainerCreating", "PodInitializing")
+        waits_for = "" if usual else f"{reason} {waiting.get('message', '')}".strip()
+    claims = [one[_CLAIM]["claimName"] for one in spec.get("volumes") or () if one.get(_CLAIM)]
+    if _CLAIM.lower() in waits_for.lower() and claims:
+        waits_for += f" ('kubectl describe pvc {claims[0]}' says why; site's option 'storage_class')"
+    return waits_for
+
+
+def _unscheduled(status: Document) -> str | None:
     for condition in status.get("conditions") or ():
         if condition["type"] == "PodScheduled" and condition["status"] == "False":
             return f"no node takes it: {condition.get('message', '')}".rstrip(": ")
-    reason = str(waiting.get("reason", ""))
-    return {"ContainerCreating": "", "PodInitializing": ""}.get(
-        reason, f"{reason} {waiting.get('message', '')}".strip()
-    )
+    return None
 
 
 def _disrupted(status: Document) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from skytether.api.manifest import ANY_TOPIC, Manifest, TopicSpec
@@ -118,43 +118,58 @@ def _row(command_topic: str, row: TopicSpec, names: Names, node: GraphNode, idle
     """One row of the service's topics; ``idle`` are the lifecycle nodes that are not active, with their states."""
     if row.kind == "topic" and row.direction == "out" and row.name == command_topic:
         return Finding(row.name, "", row.type, "drives, past the supervisor")
-    if row.kind == "call":
-        name = names.of(f"{row.name}/request").removesuffix("/request")
-        kind, verb, waits = (
-            (Kind.SERVER, "will be offered", "") if row.direction == "in" else (Kind.CLIENT, "is offered", "offers")
-        )
-    else:
-        name = names.of(row.name)
-        kind, verb, waits = (
-            (Kind.SUBSCRIPTION, "from", "publishes")
-            if row.direction == "in"
-            else (Kind.PUBLISHER, "will be published", "")
-        )
-    qos = Qos(reliable=True, transient_local=row.latched)
-    ours = Endpoint(kind, name, row.type, hash_of(row.type, "cdr"), qos)
-    others = node.endpoints(name, kind.answers)
+    ours, says, waits = _expected(row, names)
+    others = node.endpoints(ours.name, ours.kind.answers)
     wrong = [mismatch.reason for mismatch in mismatches(ours, others)]
-    if kind is Kind.PUBLISHER and isinstance(node, RclpyNode):
+    if ours.kind is Kind.PUBLISHER and isinstance(node, RclpyNode):
         wrong += clashes(ours, others)
     if wrong:
-        return Finding(row.name, name, row.type, wrong[0], good=False)
-    if waits and not others:
+        return Finding(row.name, ours.name, row.type, wrong[0], good=False)
+    if not waits:
+        return Finding(row.name, ours.name, row.type, says)
+    if not others:
         asleep = ", ".join(f"{who} ({label})" for who, label in sorted(idle.items()))
         hint = f"; lifecycle nodes that are not active: {asleep}" if asleep else ""
-        return Finding(row.name, name, row.type, f"nobody {waits} it yet; it is waited for{hint}", missing=True)
+        return Finding(row.name, ours.name, row.type, f"nobody {waits} it yet; it is waited for{hint}", missing=True)
     who = ", ".join(sorted({o.node for o in others if o.node}))
-    says = f"{verb} {who}".strip() if waits else verb
-    still = sorted({o.node for o in others if o.node in idle}) if waits else []
-    if still:
-        sleeping = ", ".join(f"{node_name} is a lifecycle node and {idle[node_name]}" for node_name in still)
-        says += f"; {sleeping}: it does nothing until it is activated (ros2 lifecycle set {still[0]} activate)"
-    if kind is Kind.SUBSCRIPTION and not row.latched and any(o.qos.reliable and o.qos.transient_local for o in others):
-        says += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
-    if kind is Kind.SUBSCRIPTION and isinstance(node, RclpyNode) and history_missed([o.qos for o in others]):
+    says = f"{says} {who}".strip() + _idle_hint(others, idle)
+    if ours.kind is Kind.SUBSCRIPTION:
+        says += _durability_hints(row, others, node)
+    return Finding(row.name, ours.name, row.type, says, missing=all(o.node in idle for o in others))
+
+
+def _expected(row: TopicSpec, names: Names) -> tuple[Endpoint, str, str]:
+    """Our side of a row, what is said of it, and what the others' side does that is waited for; empty: nothing."""
+    if row.kind == "call":
+        name = names.of(f"{row.name}/request").removesuffix("/request")
+        served = Kind.SERVER, "will be offered", ""
+        kind, says, waits = served if row.direction == "in" else (Kind.CLIENT, "is offered", "offers")
+    else:
+        name = names.of(row.name)
+        published = Kind.PUBLISHER, "will be published", ""
+        kind, says, waits = (Kind.SUBSCRIPTION, "from", "publishes") if row.direction == "in" else published
+    qos = Qos(reliable=True, transient_local=row.latched)
+    return Endpoint(kind, name, row.type, hash_of(row.type, "cdr"), qos), says, waits
+
+
+def _idle_hint(others: Sequence[Endpoint], idle: Mapping[str, str]) -> str:
+    still = sorted({o.node for o in others if o.node in idle})
+    if not still:
+        return ""
+    sleeping = ", ".join(f"{name} is a lifecycle node and {idle[name]}" for name in still)
+    return f"; {sleeping}: it does nothing until it is activated (ros2 lifecycle set {still[0]} activate)"
+
+
+def _durability_hints(row: TopicSpec, others: Sequence[Endpoint], node: GraphNode) -> str:
+    """What others keep for newcomers, and we do not get."""
+    hints = ""
+    if not row.latched and any(o.qos.reliable and o.qos.transient_local for o in others):
+        hints += "; it is transient local: reliable: true, latched: true in the manifest would keep it for newcomers"
+    if isinstance(node, RclpyNode) and history_missed([o.qos for o in others]):
         kept = ", ".join(sorted({o.node for o in others if o.qos.transient_local}))
         lost = ", ".join(sorted({o.node for o in others if not o.qos.transient_local}))
-        says += f"; what {kept} keeps for newcomers (transient local) is missed, because {lost} offers volatile"
-    return Finding(row.name, name, row.type, says, missing=bool(still) and all(o.node in idle for o in others))
+        hints += f"; what {kept} keeps for newcomers (transient local) is missed, because {lost} offers volatile"
+    return hints
 
 
 def _any(name: str, node: GraphNode) -> Finding:
