@@ -50,8 +50,9 @@ def launch(**needs: Any) -> Launch:
 def service(options: DockerOptions, namespace: Namespace | None = None, **needs: Any) -> dict[str, Any]:
     image = Declared("sha256:" + "a" * 64, ("/data",), {"Interval": 10**9})
     gpus = tuple(range(needs.get("gpu", 0)))
+    info = {"NCPU": 4, "CgroupDriver": "cgroupfs"}
     return container(
-        launch(**needs), options, "edge", image, 20_000, gpus, 4.0, {"a.example": ["192.0.2.1"]}, namespace
+        launch(**needs), options, "edge", image, 20_000, gpus, info, {"a.example": ["192.0.2.1"]}, namespace
     )
 
 
@@ -166,7 +167,7 @@ HOST: dict[str, Any] = {
         ({"Privileged": True}, "'Privileged'"),
         ({"PidMode": "host"}, "'PidMode'"),
         ({"UsernsMode": "host"}, "'UsernsMode'"),
-        ({"CgroupParent": "/"}, "'CgroupParent'"),
+        ({"CgroupnsMode": "host"}, "'CgroupnsMode'"),
         ({"VolumesFrom": ["database"]}, "'VolumesFrom'"),
         ({"Runtime": "runc"}, "'Runtime'"),
         ({"DeviceCgroupRules": ["a *:* rwm"]}, "'DeviceCgroupRules'"),
@@ -176,6 +177,9 @@ HOST: dict[str, Any] = {
         ({"NetworkMode": "container:database"}, "its network is 'container:database'"),
         ({"PortBindings": {"53/udp": [{"HostPort": "53"}]}}, "'53/udp', which no site asks for"),
         ({"IpcMode": "host"}, "it shares memory"),
+        ({"CgroupParent": "/system.slice/docker.service"}, "in a group of other processes"),
+        ({"CgroupParent": ""}, "in a group of other processes"),
+        ({"CgroupParent": ["/"]}, "in a group of other processes"),
         ({"CapDrop": []}, "it keeps rights of root"),
         ({"CapAdd": ["SYS_ADMIN"]}, "it has the rights ['SYS_ADMIN']"),
         ({"CapAdd": ["NET_ADMIN"]}, "it has the rights ['NET_ADMIN']"),

@@ -74,7 +74,7 @@ _LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
 _CONTAINER = {"Image", "Healthcheck", "User", "Env", "ExposedPorts", "Labels", "HostConfig", "Entrypoint", "Cmd"}
 _HOST = _LIMITS | {
     *("NetworkMode", "PortBindings", "Dns", "ExtraHosts", "Init", "ReadonlyRootfs", "CapDrop", "CapAdd", "SecurityOpt"),
-    *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig"),
+    *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
 _PORTS = {"7600/udp"}
@@ -244,6 +244,7 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
         _rights(host.get("CapAdd") or [], mode),
         _security(host.get("SecurityOpt")),
+        None if host.get("CgroupParent", "/") == "/" else "it is to be in a group of other processes",
         None if host.get("IpcMode", "none") in ("none", "private") else "it shares memory with others",
         # Without a type, an engine gives what is set here to its own kind of log, which may be one that goes elsewhere.
         None if (_at(host, "LogConfig") or _JSON_FILE).get("Type") == "json-file" else "its log goes elsewhere",

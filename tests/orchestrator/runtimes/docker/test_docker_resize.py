@@ -200,7 +200,7 @@ def test_an_instance_that_is_busy_gets_more_within_its_bounds(house: House) -> N
     (container,) = house.docker.containers()
     docker("exec", "-d", container, "sh", "-c", "while :; do :; done & while :; do :; done")
     until(lambda: house.record(instance).has.cpu == 0.2)
-    assert inspected(container)["HostConfig"]["CpuShares"] == 204
+    assert inspected(container)["HostConfig"]["CpuShares"] == 2048
     assert house.record(instance).attempt == 1
     assert all("cores are busy" in text for text in house.told(instance))
 

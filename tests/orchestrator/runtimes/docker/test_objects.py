@@ -75,7 +75,7 @@ def launch(**given: Any) -> Launch:
 
 
 def body(given: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
-    asked = {"image": Declared("sha256:1"), "port": None, "gpus": (), "cores": 4.0, "hosts": {}} | more
+    asked = {"image": Declared("sha256:1"), "port": None, "gpus": (), "info": {"NCPU": 4}, "hosts": {}} | more
     return container(launch(**(given or {})), options(), "me", **asked)
 
 
@@ -178,14 +178,14 @@ def test_our_own_names_are_never_pulled_and_others_are(image: str) -> None:
 
 def test_limits_come_from_the_manifest() -> None:
     host = body({"needs": {"cpu": 0.25, "memory_mb": 200}})["HostConfig"]
-    assert (host["NanoCpus"], host["CpuShares"]) == (1_000_000_000, 256)
+    assert (host["NanoCpus"], host["CpuShares"]) == (1_000_000_000, 2560)
     assert (host["Memory"], host["MemorySwap"], host["PidsLimit"]) == (200 << 20, 200 << 20, 256)
     given = {"needs": {"cpu": 2, "memory_mb": 200}, "limits": {"cpu": 2.5, "memory_mb": 300, "pids": 20}}
     host = body(given)["HostConfig"]
     assert (host["NanoCpus"], host["Memory"], host["PidsLimit"]) == (2_500_000_000, 300 << 20, 20)
     assert body({"needs": {"cpu": 2}})["HostConfig"]["NanoCpus"] == 2_000_000_000
     # An engine refuses a limit above what its machine has, and the kernel one that is next to nothing.
-    assert body({"limits": {"cpu": 8}}, cores=2.0)["HostConfig"]["NanoCpus"] == 2_000_000_000
+    assert body({"limits": {"cpu": 8}}, info={"NCPU": 2})["HostConfig"]["NanoCpus"] == 2_000_000_000
     assert body({"needs": {"cpu": 0.001}, "limits": {"cpu": 0.001}})["HostConfig"]["NanoCpus"] == 10_000_000
 
 
@@ -204,7 +204,7 @@ def test_devices_and_gpus_are_handed_over() -> None:
     assert body()["HostConfig"]["DeviceRequests"] == []
     asked = options(devices=["/dev/video0"], groups=[44])
     for needs, groups in (({"devices": ["/dev/video0"]}, ["44"]), ({}, [])):
-        made = container(launch(needs=needs), asked, "me", Declared("x"), None, (), 4.0, {})
+        made = container(launch(needs=needs), asked, "me", Declared("x"), None, (), {"NCPU": 4}, {})
         assert made["HostConfig"]["GroupAdd"] == groups
 
 
@@ -237,7 +237,7 @@ def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
 
 def test_published_and_advertised_addresses_are_two_things() -> None:
     asked = options(bind_host="0.0.0.0", advertise_host="192.0.2.7")
-    bindings = container(launch(), asked, "me", Declared("x"), 7700, (), 4.0, {})["HostConfig"]["PortBindings"]
+    bindings = container(launch(), asked, "me", Declared("x"), 7700, (), {"NCPU": 4}, {})["HostConfig"]["PortBindings"]
     assert bindings == {"7600/udp": [{"HostIp": "0.0.0.0", "HostPort": "7700"}]}
     seen = observation(ContainerState("c", "i1", 1, "running", host_port=7700, ready=True), asked)
     assert (seen.phase, seen.host, seen.port) == (Phase.RUNNING, "192.0.2.7", 7700)
@@ -871,14 +871,30 @@ def test_an_engine_that_holds_no_limits_starts_nothing_unless_told(
 
 
 @pytest.mark.parametrize(
+    ("told", "parent"),
+    [
+        ({"CgroupDriver": "cgroupfs"}, "/"),
+        ({"CgroupDriver": "cgroupfs", "SecurityOptions": ["name=seccomp,profile=default"]}, "/"),
+        ({"CgroupDriver": "cgroupfs", "SecurityOptions": ["name=seccomp", "name=rootless"]}, None),
+        ({"CgroupDriver": "cgroupfs", "Rootless": True, "SecurityOptions": None}, None),
+        ({"CgroupDriver": "systemd"}, None),
+        ({}, None),
+    ],
+)
+def test_a_container_is_weighed_against_other_programs_itself(told: dict[str, Any], parent: str | None) -> None:
+    assert body(info={"NCPU": 4, **told})["HostConfig"].get("CgroupParent") == parent
+
+
+@pytest.mark.parametrize(
     ("told", "cores", "means"),
     [
-        ({}, 8, ContainerLimits(128 << 20, 1_000_000_000, 102)),
-        ({"needs": {"cpu": 3, "memory_mb": 64}}, 2, ContainerLimits(64 << 20, 2_000_000_000, 3072)),
+        ({}, 8, ContainerLimits(128 << 20, 1_000_000_000, 1024)),
+        ({"needs": {"cpu": 3, "memory_mb": 64}}, 2, ContainerLimits(64 << 20, 2_000_000_000, 30_720)),
+        ({"needs": {"cpu": 64, "memory_mb": 64}}, 64, ContainerLimits(64 << 20, 64_000_000_000, 262_144)),
         (
             {"needs": {"cpu": 0.001}, "limits": {"cpu": 0.001, "memory_mb": 500}},
             2,
-            ContainerLimits(500 << 20, 10_000_000, 2),
+            ContainerLimits(500 << 20, 10_000_000, 10),
         ),
     ],
 )

@@ -334,13 +334,13 @@ class Job:
     ) -> ContainerState:
         """``guard`` is the image that closes the network off; None: it is closed off already, or is not to be."""
         network = self._options.network
-        cores = float(self._follower.info(self._options.timeout_s)["NCPU"])
+        info = self._follower.info(self._options.timeout_s)
         hosts = {to.host: found for to, found in openings.items() if not any("/" in address for address in found)}
         name = name_of(self._owner, self.launch.instance, self.attempt)
         with self._engine.asked():
             api = self._engine.api()
             told = declared(image, api.inspect_image(image))
-            asked = self.launch, self._options, self._owner, told, port, gpus, cores, hosts, namespace
+            asked = self.launch, self._options, self._owner, told, port, gpus, info, hosts, namespace
             body = container(*asked, epoch=self._epoch)
             try:
                 made = str(api.create_container_from_config(body, name)["Id"])

@@ -11,6 +11,12 @@ from ..containers import most_cores, most_memory_mb
 
 _LEAST_CORES = 0.01
 """The kernel gives no less."""
+_SHARES_PER_CORE = 10 * 1024
+"""Of the processors, where others want them too; other programs of the machine, the engine and what it starts, have
+1024. A robot waits for what a service says: one that needs a core goes before them. With much more, one that may use
+all cores would keep an engine from ending it."""
+_LEAST_SHARES, _MOST_SHARES = 2, 1 << 18
+"""That a kernel takes."""
 
 
 class ContainerLimits(NamedTuple):
@@ -35,7 +41,20 @@ NO_LIMITS = ContainerLimits()
 def limits_of(spec: ServiceSpec, cores: float) -> ContainerLimits:
     """Of a service's container; ``cores``: the engine's machine's, which refuses more."""
     most = max(_LEAST_CORES, min(most_cores(spec), cores))
-    return ContainerLimits(most_memory_mb(spec) << 20, int(most * 1e9), max(2, int(spec.needs.cpu * 1024)))
+    shares = max(_LEAST_SHARES, min(int(spec.needs.cpu * _SHARES_PER_CORE), _MOST_SHARES))
+    return ContainerLimits(most_memory_mb(spec) << 20, int(most * 1e9), shares)
+
+
+def parent_of(info: Mapping[str, Any]) -> dict[str, str]:
+    """Where among the machine's groups of processes a service's container belongs, by what the engine says of itself.
+
+    With systemd, containers stand beside the engine. An engine that makes its groups itself puts all containers into
+    one, which has no more of the processors than any one thread outside of it, whatever they have within.
+    """
+    if info.get("CgroupDriver") != "cgroupfs" or info.get("Rootless"):
+        return {}
+    rootless = any("name=rootless" in option for option in info.get("SecurityOptions") or ())
+    return {} if rootless else {"CgroupParent": "/"}
 
 
 def pull_limits(host_config: Mapping[str, Any]) -> ContainerLimits:

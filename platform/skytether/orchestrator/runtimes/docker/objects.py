@@ -25,7 +25,7 @@ from ..containers import (
     out_of_memory,
 )
 from ..egress import refusal_of
-from .limits import NO_LIMITS, ContainerLimits, limits_of, pull_limits
+from .limits import NO_LIMITS, ContainerLimits, limits_of, parent_of, pull_limits
 from .meter import Usage
 from .options import DockerOptions
 
@@ -226,7 +226,7 @@ def container(
     image: Declared,
     port: int | None,
     gpus: tuple[int, ...],
-    cores: float,
+    info: Mapping[str, Any],
     hosts: Mapping[str, Iterable[str]],
     namespace: Namespace | None = None,
     *,
@@ -241,7 +241,7 @@ def container(
         image: The image.
         port: UDP port to publish; None: the engine's choice.
         gpus: Numbers of its GPUs.
-        cores: Of the engine's machine, which refuses a limit above them.
+        info: What the engine says of itself and its machine.
         hosts: Addresses of the names that it may connect to.
         namespace: The network that it is to join, which says what is published; None: one of its own.
         epoch: Of the leader; 0: there is none.
@@ -274,7 +274,8 @@ def container(
             "ReadonlyRootfs": True,
             "CapDrop": ["ALL"],
             "SecurityOpt": options.security,
-            **limits_of(spec, cores).document(),
+            **limits_of(spec, float(info["NCPU"])).document(),
+            **parent_of(info),
             "PidsLimit": spec.limits.pids,
             "Tmpfs": {_TMP: _TMPFS},
             "Mounts": [
