@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 from bisect import insort_left
 from collections import deque
@@ -163,6 +164,12 @@ class PathQueue:
         """Send a packet before everything else."""
         if len(self.urgent) < MAX_URGENT:
             self.urgent.append(packet)
+
+    def queue_due(self, now: float) -> None:
+        """Queue the copies whose time has come."""
+        while self.copies and self.copies[0].due <= now:
+            copy = heapq.heappop(self.copies)
+            self.queue.put_other(copy.topic.priority, copy)
 
     def enqueue(self, message: Copy | InFlight, now: float, times: int = 1) -> None:
         """Send a message that another path has as well; a small one that many times."""

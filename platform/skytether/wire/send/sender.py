@@ -160,71 +160,84 @@ class Sender:
         if epoch is None or address is None or epoch.spent:
             return []
         path_queue = self._path_queue(path)
-        queue, in_flight, copies = path_queue.queue, path_queue.in_flight, path_queue.copies
+        queue, in_flight, pacer = path_queue.queue, path_queue.in_flight, path.pacer
         path_queue.wake = math.inf
-        if not (queue or in_flight or path_queue.urgent or (copies and copies[0].due <= now)):
+        if path_queue.copies:
+            path_queue.queue_due(now)
+        if not (queue or in_flight or path_queue.urgent):
             return []
-        while copies and copies[0].due <= now:
-            copy = heapq.heappop(copies)
-            queue.put_other(copy.topic.priority, copy)
-        pacer = path.pacer
         left = min(pacer.budget(now), self._config.burst)
         batches = Batches(path.id, address)
-        for packet in path_queue.urgent:
-            batches.add(packet)
-            left -= len(packet)
-            path.bytes_sent += len(packet)
-            epoch.bytes_sent += len(packet)
-            pacer.spend(len(packet))
-        path_queue.urgent.clear()
+        if path_queue.urgent:
+            left -= self._send_urgent(epoch, path_queue, batches)
         while (priority := queue.priority) >= 0 or in_flight:
             if in_flight and in_flight[-1].topic.priority >= priority:
-                top = in_flight[-1]
-                shards = top.shards
-                if top.deadline < now:
-                    in_flight.pop()
-                    top.topic.counters.expired += 1
-                    continue
-                if not shards.remaining:  # delivered or given up meanwhile
-                    in_flight.pop()
-                    shards.land(now)
-                    continue
-                size = shards.packet_size
-                need = min(shards.remaining * size, max(size, pacer.quantum // size * size))
-                if left < need:
-                    path_queue.wake = pacer.ready_at(need)
+                sent = self._send_shards(path_queue, batches, left, now)
+                if sent is None:
                     break
-                path.large = True
-                top.sent_at = now
-                count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
-                counters = top.topic.counters
-                counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
-                batches.add_run(shards.make_packets(count, path.id, path.number(count), ticks(now)), size)
-                shards.sent(count, now)
-                sent = count * size
-                counters.bytes_sent += sent
-                if not shards.remaining:
-                    in_flight.pop()
-                    shards.land(now)
             elif left <= 0 and priority < CONTROL_PRIORITY:
                 path_queue.wake = pacer.ready_at(1)
                 break
             else:
-                item = queue.pop(now)
-                if isinstance(item, Copy):
-                    sent = self._send_copy(item, path_queue, batches, now)
-                elif isinstance(item, ReliableSender):
-                    sent = self._send_reliable(epoch, item, path_queue, batches, now)
-                elif item is not None:
-                    sent = self._send_first(epoch, *item, path_queue, batches, now)
-                else:
-                    continue
+                sent = self._send_queued(epoch, path_queue, batches, now)
             left -= sent
             path.bytes_sent += sent
             epoch.bytes_sent += sent
             pacer.spend(sent)
         batches.flush()
         return batches.done
+
+    @staticmethod
+    def _send_urgent(epoch: Epoch, path_queue: PathQueue, batches: Batches) -> int:
+        """Send what waits for nothing. Returns bytes sent."""
+        sent = 0
+        for packet in path_queue.urgent:
+            batches.add(packet)
+            sent += len(packet)
+        path_queue.urgent.clear()
+        path_queue.path.bytes_sent += sent
+        epoch.bytes_sent += sent
+        path_queue.path.pacer.spend(sent)
+        return sent
+
+    @staticmethod
+    def _send_shards(path_queue: PathQueue, batches: Batches, left: float, now: float) -> int | None:
+        """Send some of the large message that comes first. Returns bytes sent; None: it waits for the pacer."""
+        path, top = path_queue.path, path_queue.in_flight[-1]
+        shards, counters, pacer = top.shards, top.topic.counters, path.pacer
+        if top.deadline < now:
+            path_queue.in_flight.pop()
+            counters.expired += 1
+            return 0
+        size, sent = shards.packet_size, 0
+        if shards.remaining:  # else delivered or given up meanwhile
+            need = min(shards.remaining * size, max(size, pacer.quantum // size * size))
+            if left < need:
+                path_queue.wake = pacer.ready_at(need)
+                return None
+            path.large = True
+            top.sent_at = now
+            count = min(shards.remaining, int(left // size), MAX_SEGMENTS, MAX_BATCH // size)
+            counters.bytes_redundant += min(max(count - shards.remaining_data, 0), count) * size
+            batches.add_run(shards.make_packets(count, path.id, path.number(count), ticks(now)), size)
+            shards.sent(count, now)
+            sent = count * size
+            counters.bytes_sent += sent
+        if not shards.remaining:
+            path_queue.in_flight.pop()
+            shards.land(now)
+        return sent
+
+    def _send_queued(self, epoch: Epoch, path_queue: PathQueue, batches: Batches, now: float) -> int:
+        """Send the next of the queue. Returns bytes sent."""
+        item = path_queue.queue.pop(now)
+        if isinstance(item, Copy):
+            return self._send_copy(item, path_queue, batches, now)
+        if isinstance(item, ReliableSender):
+            return self._send_reliable(epoch, item, path_queue, batches, now)
+        if item is not None:
+            return self._send_first(epoch, *item, path_queue, batches, now)
+        return 0
 
     def _send_first(
         self,
