@@ -49,3 +49,47 @@ def test_a_watch_that_ends_at_once_is_not_begun_again_and_again(follow: Callable
     threading.Event().wait(0.3)  # in which there would be thousands
     watch.close()
     assert cluster.watches <= 2
+
+
+class Idle:
+    """A watch of which nothing comes before ``ended``."""
+
+    connection = None
+
+    def __init__(self, ended: threading.Event) -> None:
+        self._ended = ended
+
+    def stream(self, _: int) -> Iterator[bytes]:
+        self._ended.wait(60)
+        return iter(())
+
+
+class Slow(Hasty):
+    """An API server whose answer to a watch comes only when whoever follows was told to end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cut, self.ended = threading.Event(), threading.Event()
+
+    @contextmanager
+    def stream(self, path: str, silence_s: float, **query: str | int) -> Iterator[Any]:
+        self.watched.set()
+        self.cut.wait(10)
+        yield Idle(self.ended)
+
+
+def test_who_ends_while_a_watch_is_being_begun_does_not_wait_for_that() -> None:
+    cluster = Slow()
+
+    class Followed(Nodes):
+        def _cut(self) -> None:
+            super()._cut()
+            cluster.cut.set()
+
+    nodes = Followed(cluster)  # type: ignore[arg-type]
+    nodes.start()
+    assert cluster.watched.wait(10)
+    nodes.close()
+    left = [one.name for one in threading.enumerate() if one.name == "kubernetes-nodes"]
+    cluster.ended.set()
+    assert left == []

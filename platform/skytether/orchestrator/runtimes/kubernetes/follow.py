@@ -95,6 +95,8 @@ class Follower(ABC):
         with self._cluster.stream(self._path, _SILENCE_S, **query) as answer:
             self._answer = answer
             try:
+                if self._closing.is_set():
+                    return ""  # `close` found nothing to cut yet
                 for event in _events(answer):
                     if self._closing.is_set():
                         return ""
