@@ -189,9 +189,9 @@ def test_the_service_manager_is_told_and_missed_by_nobody(tmp_path, monkeypatch)
         manager.settimeout(30)
         monkeypatch.setenv("NOTIFY_SOCKET", str(path))
         systemd = Systemd()
-        systemd.tell("READY=1")
+        systemd.notify("READY=1")
         assert manager.recv(64) == b"READY=1"
-    systemd.tell("WATCHDOG=1")  # nobody listens any more
+    systemd.notify("WATCHDOG=1")  # nobody listens any more
     systemd.close()
     monkeypatch.delenv("NOTIFY_SOCKET")
-    Systemd().tell("READY=1")
+    Systemd().notify("READY=1")

@@ -143,7 +143,7 @@ class Guard:
         while not ended() and not self._claim.lost:
             self.turn()
         lost = self._claim.lost
-        self._systemd.tell("STOPPING=1")
+        self._systemd.notify("STOPPING=1")
         if lost:
             self._log.line("ERROR", f"{lost} was removed or replaced: nobody could stop this guard; it brakes and ends")
         self._event("guard", "end", f"{lost} was removed or replaced" if lost else "told to end")
@@ -194,7 +194,7 @@ class Guard:
                 self._answer_gate(now)
                 self._ready = True
         self._look_after(self._clock())
-        self._systemd.tell("READY=1\nWATCHDOG=1" if self._ready else "WATCHDOG=1")
+        self._systemd.notify("READY=1\nWATCHDOG=1" if self._ready else "WATCHDOG=1")
 
     def _hear(self, most: int = _MOST_PACKETS) -> bool:
         """Take in what the gate says. True if it said anything."""
@@ -340,7 +340,7 @@ class Guard:
             self._watch.forget()
             self._tell(now)
             self._answer_gate(now)
-            self._systemd.tell("WATCHDOG=1")
+            self._systemd.notify("WATCHDOG=1")
             time.sleep(self._settings.period_s)
 
     def _stop(self, who: str, reason: str) -> bool:

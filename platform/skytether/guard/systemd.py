@@ -15,7 +15,7 @@ class Systemd:
         if self._socket is not None:
             self._socket.setblocking(False)
 
-    def tell(self, state: str) -> None:
+    def notify(self, state: str) -> None:
         """``READY=1``, ``WATCHDOG=1``, ``STOPPING=1``."""
         if self._socket is not None:
             try:
