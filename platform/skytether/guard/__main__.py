@@ -15,7 +15,7 @@ from .settings import load, thaw
 
 def main() -> None:
     """Guard the wheels."""
-    refused = privileges.take(privileges.GUARD)
+    refused = privileges.acquire(privileges.GUARD)
     log = Log("guard")
     try:
         file = int(sys.argv[1])

@@ -63,7 +63,7 @@ class Guard:
     Args:
         settings: What is configured.
         log: For people.
-        refused: What `privileges.take` was not permitted, for the status.
+        refused: What `privileges.acquire` was not permitted, for the status.
         clock: `clock.now`; replaced by tests only.
 
     Raises:

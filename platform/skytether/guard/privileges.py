@@ -12,7 +12,7 @@ _MAY_LOCK = 1 << 14
 """CAP_IPC_LOCK."""
 
 
-def take(priority: int) -> list[str]:
+def acquire(priority: int) -> list[str]:
     """Take what is permitted.
 
     Args:

@@ -68,7 +68,7 @@ class GateLoop:
         sensors: Where readings come from.
         wheels: For the day that nobody else tells them anything.
         board: What the wheels were told.
-        refused: What `privileges.take` was not permitted, for the status.
+        refused: What `privileges.acquire` was not permitted, for the status.
         clock: `skytether.guard.clock.now`; replaced by tests only.
     """
 
@@ -269,7 +269,7 @@ def main() -> None:
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
     warm([*config.kinds().values(), Twist], config.encoding)
-    refused = privileges.take(privileges.GATE)
+    refused = privileges.acquire(privileges.GATE)
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
     sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)

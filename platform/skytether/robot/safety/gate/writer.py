@@ -154,7 +154,7 @@ def main() -> None:
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
     warm([Twist], config.encoding)
-    for sentence in privileges.take(privileges.WRITER):
+    for sentence in privileges.acquire(privileges.WRITER):
         _log.info("%s", sentence)
     wheels = open_wheels(config, "guard")
     writer = Writer(config, guard, wheels, Board(int(sys.argv[3])))
