@@ -19,7 +19,7 @@ def claim(tmp_path):
     (tmp_path / "run" / "stop.sock").touch()
     claim = Claim(str(tmp_path / "run"))
     claim.add(str(tmp_path / "run" / "stop.sock"))
-    claim.look()
+    claim.check()
     assert not claim.lost
     return claim
 
@@ -38,13 +38,13 @@ def test_a_file_that_is_removed_or_replaced_is_a_folder_that_is_lost(claim, tmp_
     file.rename(tmp_path / "kept")  # so that its inode is not given to the next file
     if again:
         file.touch()
-    claim.look()
+    claim.check()
     assert claim.lost == str(file)
 
 
 def test_a_folder_that_is_replaced_is_lost(claim, tmp_path):
     (tmp_path / "run").rename(tmp_path / "old")
-    claim.look()
+    claim.check()
     assert claim.lost
 
 

@@ -51,13 +51,13 @@ class Claim:
         finally:
             os.umask(before)
         try:
-            self._take(folder, time.monotonic() + patience_s)
+            self._acquire(folder, time.monotonic() + patience_s)
         except ClaimError:
             os.close(self._lock)  # else the number stays taken for as long as whoever asked lives
             raise
         self._files = {path: _identity(os.fstat(self._lock))}
 
-    def _take(self, folder: str, end: float) -> None:
+    def _acquire(self, folder: str, end: float) -> None:
         try:
             while not _locked(self._lock, fcntl.LOCK_EX):
                 if guarded(folder) or time.monotonic() > end:
@@ -74,8 +74,8 @@ class Claim:
         """Look from now on, in a thread of its own: a disk that hangs holds up nothing else."""
         threading.Thread(target=self._run, name="claim", daemon=True).start()
 
-    def look(self) -> None:
-        """Look once."""
+    def check(self) -> None:
+        """Look once whether the files are still ours."""
         for path, identity in self._files.items():
             try:
                 there = _identity(os.stat(path)) == identity
@@ -89,7 +89,7 @@ class Claim:
     def _run(self) -> None:
         while not self.lost:
             time.sleep(_LOOK_S)
-            self.look()
+            self.check()
 
 
 class Heir:
