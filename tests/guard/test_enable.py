@@ -46,7 +46,7 @@ def test_it_changes_only_while_all_is_well_or_the_robot_brakes(sequence):
     for well, told, stands, count, dt in sequence:
         for _ in range(count):
             now += dt
-            on = power.look(now, well=well, told=told, stands=stands)
+            on = power.update(now, well=well, told=told, stands=stands)
             if well and told:
                 wrong_at, cut = None, False
                 assert on
@@ -60,26 +60,26 @@ def test_it_changes_only_while_all_is_well_or_the_robot_brakes(sequence):
 
 def test_a_stop_brakes_with_power_and_then_takes_it_away():
     power = Power(BRAKING, AFTER)
-    assert power.look(1.0, well=True, told=True, stands=False)
-    assert power.look(1.1, well=False, told=True, stands=False)  # it brakes
-    assert power.look(1.3, well=False, told=True, stands=True)  # it is told to stand
-    assert power.look(1.59, well=False, told=True, stands=True)
-    assert not power.look(1.61, well=False, told=True, stands=True)  # 0.3 s later
-    assert power.look(1.7, well=True, told=True, stands=True)  # a reset: all is well
+    assert power.update(1.0, well=True, told=True, stands=False)
+    assert power.update(1.1, well=False, told=True, stands=False)  # it brakes
+    assert power.update(1.3, well=False, told=True, stands=True)  # it is told to stand
+    assert power.update(1.59, well=False, told=True, stands=True)
+    assert not power.update(1.61, well=False, told=True, stands=True)  # 0.3 s later
+    assert power.update(1.7, well=True, told=True, stands=True)  # a reset: all is well
 
 
 def test_what_does_not_come_to_a_standstill_in_time_is_cut():
     power = Power(BRAKING, AFTER)
-    power.look(1.0, well=True, told=True, stands=False)
-    assert power.look(1.01, well=False, told=True, stands=False)
-    assert power.look(1.7, well=False, told=True, stands=False)
-    assert not power.look(1.72, well=False, told=True, stands=False)
+    power.update(1.0, well=True, told=True, stands=False)
+    assert power.update(1.01, well=False, told=True, stands=False)
+    assert power.update(1.7, well=False, told=True, stands=False)
+    assert not power.update(1.72, well=False, told=True, stands=False)
 
 
 def test_it_never_was_well_so_it_never_changes():
     power = Power(BRAKING, AFTER)
-    assert not power.look(1.0, well=False, told=True, stands=True)
-    assert not power.look(1.0, well=True, told=False, stands=True)
+    assert not power.update(1.0, well=False, told=True, stands=True)
+    assert not power.update(1.0, well=True, told=False, stands=True)
 
 
 def test_every_turn_is_an_edge_and_it_ends_low():

@@ -184,7 +184,7 @@ class Power:
         self._stood_since: float | None = None
         self._cut = True
 
-    def look(self, now: float, *, well: bool, told: bool, stands: bool) -> bool:
+    def update(self, now: float, *, well: bool, told: bool, stands: bool) -> bool:
         """Whether the signal is to change now.
 
         Args:
@@ -226,8 +226,8 @@ class Enable:
         """Why the line cannot be set; empty: it can."""
 
     def turn(self, now: float, *, well: bool, told: bool, stands: bool) -> None:
-        """Once for every velocity that the wheels are told; see `Power.look`. Never raises, never waits."""
-        on = self._power.look(now, well=well, told=told, stands=stands)
+        """Once for every velocity that the wheels are told; see `Power.update`. Never raises, never waits."""
+        on = self._power.update(now, well=well, told=told, stands=stands)
         if not on and not self.on and not self._high:
             return
         line = self._had(now)
