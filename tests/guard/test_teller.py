@@ -60,7 +60,7 @@ class One:
     def turn(self, now, wanted=None, stopped=False):
         self.now = now
         if wanted is not None:
-            self.watch.hear(Beat(now, wanted))
+            self.watch.on_beat(Beat(now, wanted))
         self.teller.look()
         return self.teller.tell(now, stopped)
 

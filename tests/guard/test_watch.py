@@ -40,7 +40,7 @@ def driving() -> Watch:
     """0.2 m/s and 0.4 rad/s at 1.0 s."""
     watch = Watch(BOUNDS, PERIOD, PATIENCE)
     watch.wrote(Velocity(0.2, 0.4), 0.98)
-    watch.hear(Beat(1.0, Velocity(0.2, 0.4)))
+    watch.on_beat(Beat(1.0, Velocity(0.2, 0.4)))
     assert told(watch, 1.0) == ((0.2, 0.4), "")
     return watch
 
@@ -59,7 +59,7 @@ def test_what_is_fresh_goes_to_the_wheels_and_what_is_not_brakes():
 def test_what_is_far_away_is_reached_with_the_acceleration_and_no_faster():
     watch = Watch(BOUNDS, PERIOD, PATIENCE)
     watch.wrote(STANDSTILL, 1.0)
-    watch.hear(Beat(1.02, Velocity(0.25, 0.0)))
+    watch.on_beat(Beat(1.02, Velocity(0.25, 0.0)))
     assert told(watch, 1.02)[0] == pytest.approx((0.02, 0.0))
     assert told(watch, 1.03)[0] == pytest.approx((0.03, 0.0))
 
@@ -72,7 +72,7 @@ def test_a_gap_a_failed_write_and_nothing_at_all_are_a_standstill(then):
         now = 1.101
     if then == "failed":
         watch.failed(now)
-    watch.hear(Beat(now + 0.02, Velocity(0.2, 0.4)))
+    watch.on_beat(Beat(now + 0.02, Velocity(0.2, 0.4)))
     velocity, wrong = told(watch, now + 0.02)
     assert wrong == ""
     assert velocity.linear <= 0.02 * 1.0 + 1e-9
@@ -81,10 +81,10 @@ def test_a_gap_a_failed_write_and_nothing_at_all_are_a_standstill(then):
 
 def test_what_somebody_else_told_the_wheels_later_counts():
     watch = driving()
-    watch.hear(Beat(1.02, Velocity(0.2, 0.4)))
+    watch.on_beat(Beat(1.02, Velocity(0.2, 0.4)))
     watch.learn(LastCommand(Velocity(0.1, 0.2), 1.01))
     assert told(watch, 1.02)[0] == pytest.approx((0.11, 0.22))
-    watch.hear(Beat(1.04, Velocity(0.11, 0.22)))
+    watch.on_beat(Beat(1.04, Velocity(0.11, 0.22)))
     watch.learn(LastCommand(STANDSTILL, 1.01))  # before what was told last
     assert told(watch, 1.04)[0] == pytest.approx((0.11, 0.22))
     watch.learn(LastCommand(Velocity(nan, 0.0), 1.05))
@@ -94,7 +94,7 @@ def test_what_somebody_else_told_the_wheels_later_counts():
 
 def test_stopped_brakes_whatever_is_wanted():
     watch = driving()
-    watch.hear(Beat(1.02, Velocity(0.25, 0.5)))
+    watch.on_beat(Beat(1.02, Velocity(0.25, 0.5)))
     assert told(watch, 1.02, stopped=True) == ((pytest.approx(0.16), pytest.approx(0.32)), "")
 
 
@@ -115,7 +115,7 @@ def test_before_anybody_says_anything_the_wheels_stand():
 )
 def test_a_gate_gone_mad_is_not_followed(velocity, says):
     watch = driving()
-    watch.hear(Beat(1.01, Velocity(*velocity)))
+    watch.on_beat(Beat(1.01, Velocity(*velocity)))
     braked, wrong = told(watch, 1.01)
     assert says in wrong
     assert braked == pytest.approx((0.18, 0.36))
@@ -138,7 +138,7 @@ def test_whatever_is_wanted_the_wheels_are_never_told_more_than_the_limits(steps
     for dt, linear, angular, what in steps:
         before, gap = watch.told, now + dt - watch.told.at
         now += dt
-        watch.hear(Beat(now, Velocity(linear, angular)))
+        watch.on_beat(Beat(now, Velocity(linear, angular)))
         velocity, _ = told(watch, now, stopped=what == "stopped")
         base, step = (before.velocity, gap) if gap <= PATIENCE else (STANDSTILL, PERIOD)
         assert 0 <= velocity.linear <= 0.25

@@ -188,7 +188,7 @@ class Drive:
         self._at(self.now + gap, "gate")
 
     def _do_beat(self, beat: Beat) -> None:
-        self.watch.hear(beat)
+        self.watch.on_beat(beat)
         self._look()
 
     def _do_guard(self, _: None) -> None:

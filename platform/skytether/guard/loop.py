@@ -224,7 +224,7 @@ class Guard:
         if newest is None or gate is None:
             return False
         gate.heard_at = self._clock()
-        self._watch.hear(newest)
+        self._watch.on_beat(newest)
         fresh = 0 <= gate.heard_at - newest.at <= self._settings.patience_s
         if newest.reset and fresh and self._latch.reset(newest.seen):
             self._event("person", "reset", "the emergency stop was reset")

@@ -33,7 +33,7 @@ class Watch:
         self.patience_s = patience_s
         self._beat: Beat | None = None
 
-    def hear(self, beat: Beat) -> None:
+    def on_beat(self, beat: Beat) -> None:
         """Take in what is wanted."""
         self._beat = beat
 

@@ -106,7 +106,7 @@ class _Rehearsed:
         if (told := differs(self._watch.told, self._said, self.now, self._patience, self._period)) is not None:
             self._gate.rebase(*told)
         self._said = self._gate.step(self.now).velocity
-        self._watch.hear(Beat(self.now, self._said))
+        self._watch.on_beat(Beat(self.now, self._said))
         velocity, _ = self._watch.want(self.now)
         self._watch.wrote(velocity, self.now)
         self.told.append(SentVelocity(self.now, velocity))

@@ -111,7 +111,7 @@ class Stage:
         if heard is None and self.now < self.due["guard"]:
             return
         if heard is not None:
-            self.guard_watch.hear(heard)
+            self.guard_watch.on_beat(heard)
             with suppress(BlockingIOError):
                 self.from_gate.send(pack_answer(Answer(self.now)))
         self.guard.hear()

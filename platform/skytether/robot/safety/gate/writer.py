@@ -123,7 +123,7 @@ class Writer:
                 self._enable(level)
         if newest is None or newest.at == self._wanted_at:
             return False
-        self._watch.hear(newest)
+        self._watch.on_beat(newest)
         self._wanted_at = newest.at
         return True
 
