@@ -248,7 +248,7 @@ class Guard:
             self._trouble(wrong.split()[0], "brake", f"the gate {wrong}; the guard stops the wheels", now)
         try:
             if isinstance(self._wheels, WriterWheels):
-                self._wheels.hear()
+                self._wheels.receive()
                 self._watch.learn(self._board.newest())
                 self._wheels.write(*self._watch.asks(now, stopped))
                 if self._wheels.trouble:

@@ -94,7 +94,7 @@ class WriterWheels:
         """Another writer, not heard yet, or none."""
         self.link, self.heard_at, self.trouble = link, None, ""
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Take in that the writer is alive."""
         while self.link is not None:
             try:
