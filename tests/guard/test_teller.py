@@ -55,14 +55,14 @@ class One:
         self.late = 0.0
         self.now = nan
         self.teller = Teller(self.wheels, self.watch, self.board, role, PERIOD, lambda: self.now + self.late)
-        self.teller.look()
+        self.teller.refresh()
 
     def turn(self, now, wanted=None, stopped=False):
         self.now = now
         if wanted is not None:
             self.watch.on_beat(Beat(now, wanted))
-        self.teller.look()
-        return self.teller.tell(now, stopped)
+        self.teller.refresh()
+        return self.teller.write_velocity(now, stopped)
 
 
 @pytest.fixture

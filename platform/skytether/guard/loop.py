@@ -255,8 +255,8 @@ class Guard:
                     kind = "unread"
                     raise OSError(self._wheels.trouble)
             else:
-                self._wheels.look()
-                told = self._wheels.tell(now, stopped)
+                self._wheels.refresh()
+                told = self._wheels.write_velocity(now, stopped)
             self._troubles.pop("wheels", None)
         except OSError as error:  # tried again in a moment; a motor drive that hears nothing stops by itself
             sentence = f"the wheels cannot be told anything: {error.strerror or error}"

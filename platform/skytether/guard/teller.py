@@ -108,14 +108,14 @@ class Teller:
         self._full_at = nan
         self._own, self._claim = board.of(role)  # of who had the role before
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
         self._watch.learn(self._board.newest())
         before, self._listeners = self._listeners, self._wheels.listeners()
         self._strangers = bool(self._listeners) and not (before and self._listeners and before & self._listeners)
 
-    def tell(self, now: float, stopped: bool = False) -> bool:
-        """Tell the wheels once what the watch has for them. `look` comes before.
+    def write_velocity(self, now: float, stopped: bool = False) -> bool:
+        """Tell the wheels once what the watch has for them. `refresh` comes before.
 
         Args:
             now: [s]

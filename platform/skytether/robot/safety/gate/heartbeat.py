@@ -62,7 +62,7 @@ class Heartbeat:
 
     def hear(self) -> None:
         """Take in what the guard answers, and what the wheels were told."""
-        self._teller.look()
+        self._teller.refresh()
         for _ in range(_PACKETS):
             try:
                 data = self._guard.recv(LARGEST)
@@ -118,7 +118,7 @@ class Heartbeat:
     def _speak(self, now: float) -> bool:
         """Tell the wheels to stop, if it is the gate's turn."""
         try:
-            return self._teller.tell(now)
+            return self._teller.write_velocity(now)
         except Exception as error:  # tried again at the next turn
             self._trouble("wheels", f"the wheels cannot be told to stand: {error}", now)
             return True

@@ -135,9 +135,9 @@ class Writer:
 
     def _tell(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
-        self._teller.look()
+        self._teller.refresh()
         try:
-            return self._teller.tell(now)
+            return self._teller.write_velocity(now)
         except Exception as error:  # tried again in a moment
             self._log_throttle.say("wheels", f"the wheels cannot be told anything: {error}", now)
             return True
