@@ -184,19 +184,19 @@ class Guard:
                 wait = min(wait, rests)
             select.select(waited, [], [], max(0.0, wait))
         self._requests.turn()
-        beat = self._hear()
+        beat = self._receive()
         now = self._clock()  # after it: what is said later than now would be from the future
         if beat or now >= self._due:
-            told = self._tell(now)
+            told = self._write_velocity(now)
             self._last = now
             self._due = self._next(now) if told else now + self._settings.period_s / 2
             if beat:
                 self._answer_gate(now)
                 self._ready = True
-        self._look_after(self._clock())
+        self._supervise_children(self._clock())
         self._systemd.notify("READY=1\nWATCHDOG=1" if self._ready else "WATCHDOG=1")
 
-    def _hear(self, most: int = _MOST_PACKETS) -> bool:
+    def _receive(self, most: int = _MOST_PACKETS) -> bool:
         """Take in what the gate says. True if it said anything."""
         gate, newest = self._gate, None
         for _ in range(most):
@@ -240,7 +240,7 @@ class Guard:
         repeat = repeat_s(self._settings.period_s, self._settings.patience_s)
         return self._watch.due(now, repeat, bool(self._latch.reason))
 
-    def _tell(self, now: float) -> bool:
+    def _write_velocity(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
         stopped, told, kind = bool(self._latch.reason), True, "wheels"
         wrong = self._watch.target(now, stopped)[1]
@@ -286,7 +286,7 @@ class Guard:
             except OSError:  # it does not read; it will hang or have ended
                 return
 
-    def _look_after(self, now: float) -> None:
+    def _supervise_children(self, now: float) -> None:
         """Start what is not there, end what hangs."""
         self._dead = [child for child in self._dead if not child.reaped()]
         self._gate = self._kept_alive("gate", self._gate, self._settings.gate, now)
@@ -317,7 +317,7 @@ class Guard:
         self._event(name, "death", why)
         self._restarts[name] = self._restarts.get(name, 0) + 1
         if name == "gate":
-            self._hear(_LAST_PACKETS)  # its last word may be a stop
+            self._receive(_LAST_PACKETS)  # its last word may be a stop
             self._watch.forget()
         child.end()
         self._dead.append(child)
@@ -336,9 +336,9 @@ class Guard:
             now = self._clock()
             if self._watch.told.velocity == STANDSTILL or now - self._watch.told.at > self._settings.patience_s:
                 last -= 1
-            self._hear()
+            self._receive()
             self._watch.forget()
-            self._tell(now)
+            self._write_velocity(now)
             self._answer_gate(now)
             self._systemd.notify("WATCHDOG=1")
             time.sleep(self._settings.period_s)
