@@ -50,7 +50,7 @@ class Onlooker:
                     self.trouble = f"the {self._name} cannot be started: {error}"
                     self._log.trouble(self._name, self.trouble, now)
             return
-        self._hear(self._child, now)
+        self._receive(self._child, now)
         why = self._child.ended(now)
         if why:
             self.trouble = f"the {self._name} {why}; the robot goes on, and it is started anew"
@@ -70,7 +70,7 @@ class Onlooker:
         if self._child is not None:
             self._child.end()
 
-    def _hear(self, child: Child, now: float) -> None:
+    def _receive(self, child: Child, now: float) -> None:
         for _ in range(_PACKETS):
             try:
                 data = receive(child.socket, 1)[0]
