@@ -76,7 +76,7 @@ class Requests:
             if source is self._listener:
                 self._accept()
             else:
-                self._take(source)
+                self._receive(source)
 
     def close(self) -> None:
         """Close all."""
@@ -100,9 +100,9 @@ class Requests:
                 idle = [known for known, pending in self._clients.items() if pending is None]
                 self._drop(next(iter(idle or self._clients)))
             self._clients[client] = None
-            self._take(client)
+            self._receive(client)
 
-    def _take(self, client: socket.socket) -> None:
+    def _receive(self, client: socket.socket) -> None:
         try:
             data, _, _ = receive(client, _LARGEST)
         except BlockingIOError:
