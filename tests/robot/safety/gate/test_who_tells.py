@@ -114,7 +114,7 @@ class Stage:
             self.guard_watch.on_beat(heard)
             with suppress(BlockingIOError):
                 self.from_gate.send(pack_answer(Answer(self.now)))
-        self.guard.hear()
+        self.guard.receive()
         self.guard_watch.learn(self.board.newest())
         with suppress(OSError):
             self.guard.write(*self.guard_watch.asks(self.now))
