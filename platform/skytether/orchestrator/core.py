@@ -94,7 +94,7 @@ class Orchestrator:
         self.store = Store(
             database,
             settings.quotas.robot_names,
-            key_id=lambda: secrets.fingerprint,
+            key_id=secrets.fingerprint,
             on_change=self.broker.publish,
         )
         self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
@@ -108,6 +108,7 @@ class Orchestrator:
         self.gates = Gates(self.store, settings.timing.gate_silent, clock)
         self.shared_topics = SharedTopics(self.store, clock)
         self.heartbeat = Heartbeat(self.store, settings.advertise, clock)
+        self.leadership = Leadership(self.store.lock())
         self.metrics = Metrics(
             self._running,
             settings.limits.reported_topics,
@@ -119,7 +120,6 @@ class Orchestrator:
             lambda: self.leadership.epoch,
             self._group_gauges,
         )
-        self.leadership = Leadership(self.store.lock(), lambda: self._passes.leases.owe())
         self.catalog = Catalog(self.store, settings.catalog)
         self.overload = Overload()
         limiter = RateLimiter(settings.limits.requests_per_s, settings.limits.requests_burst, time.monotonic)

@@ -25,19 +25,19 @@ CLAIM = "c" * 43
 
 def test_sessions_keep_their_key_and_new_ones_have_another(tmp_path: Path) -> None:
     secrets = Secrets(tmp_path)
-    before, first = secrets.fingerprint, secrets.session_key(ID)
+    before, first = secrets.fingerprint(), secrets.session_key(ID)
     assert not secrets.look()
     kept = rotate_key(tmp_path)
     assert kept.stat().st_mode & 0o777 == 0o600
     assert secrets.look()
-    assert secrets.fingerprint != before
-    assert secrets.old_fingerprints == (before,)
+    assert secrets.fingerprint() != before
+    assert secrets.old_fingerprints() == (before,)
     assert secrets.session_key(ID, before) == first
     assert secrets.session_key(ID) == first, "one from before fingerprints were noted"
-    assert secrets.session_key(ID, secrets.fingerprint) != first
-    second = secrets.fingerprint
+    assert secrets.session_key(ID, secrets.fingerprint()) != first
+    second = secrets.fingerprint()
     rotate_key(tmp_path)
-    assert Secrets(tmp_path).old_fingerprints == (before, second)
+    assert Secrets(tmp_path).old_fingerprints() == (before, second)
     with pytest.raises(SecretFileError, match="is not in"):
         secrets.session_key(ID, "00" * 16)
 
@@ -46,17 +46,17 @@ def test_a_session_of_a_key_that_another_orchestrator_saw_first(tmp_path: Path) 
     slow, quick = Secrets(tmp_path), Secrets(tmp_path)
     rotate_key(tmp_path)
     quick.look()
-    assert slow.session_key(ID, quick.fingerprint) == quick.session_key(ID, quick.fingerprint)
+    assert slow.session_key(ID, quick.fingerprint()) == quick.session_key(ID, quick.fingerprint())
 
 
 def test_what_cannot_be_used_changes_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture, store: Any) -> None:
     secrets = Secrets(tmp_path)
     rotation = Rotation(tmp_path, secrets, store, time.time)
-    before = secrets.fingerprint
+    before = secrets.fingerprint()
     (tmp_path / "secret.key").rename(tmp_path / "away")
     for _ in range(3):
         rotation.look()
-    assert secrets.fingerprint == before
+    assert secrets.fingerprint() == before
     assert not (tmp_path / "secret.key").exists(), "no other one is made while sessions run"
     assert caplog.text.count("secret.key is gone: put it back") == 1
     with pytest.raises(SecretFileError, match=r"cannot change .*secret\.key"):
@@ -70,17 +70,17 @@ def test_a_key_that_could_not_be_used_is_once_it_is_mended(
     """Somebody copies a key from another orchestrator, and chmods it only when told so."""
     secrets = Secrets(tmp_path)
     rotation = Rotation(tmp_path, secrets, store, time.time)
-    before = secrets.fingerprint
+    before = secrets.fingerprint()
     (tmp_path / "copy").write_bytes(b"k" * 32)
     (tmp_path / "copy").chmod(0o644)
     (tmp_path / "copy").replace(tmp_path / "secret.key")
     for _ in range(3):
         rotation.look()
-    assert secrets.fingerprint == before
+    assert secrets.fingerprint() == before
     assert caplog.text.count("can be read by others: chmod 600") == 1
     (tmp_path / "secret.key").chmod(0o600)
     assert secrets.look()
-    assert secrets.fingerprint == fingerprint_of(b"k" * 32)
+    assert secrets.fingerprint() == fingerprint_of(b"k" * 32)
 
 
 def test_an_old_key_is_on_the_disk_before_another_takes_its_place(
@@ -110,10 +110,10 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(
     folder = tmp_path / "secrets"
     secrets, ahead = Secrets(folder), [0.0]
     rotation = Rotation(folder, secrets, store, lambda: time.time() + ahead[0])
-    store.key_id = lambda: secrets.fingerprint
+    store.key_id = lambda: secrets.fingerprint()
     assert rotation.agree()
     record = store.add(new_record(), "operator", None, "")
-    first = secrets.fingerprint
+    first = secrets.fingerprint()
     assert record.key_id == first
     old = rotate_key(folder)
     ahead[0] = 120.0
@@ -131,7 +131,7 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(
     rotation.look()
     assert not old.exists()
     rotation.look()
-    assert secrets.old_fingerprints == ()
+    assert secrets.old_fingerprints() == ()
     assert caplog.text.count("were changed") == 1, "at the rotation, and not where a key was forgotten"
 
 
@@ -153,7 +153,7 @@ def test_nothing_ends_where_secrets_are_rotated(served: Any, tmp_path: Path) -> 
     new = robot.wait_running(robot.create_instance(InstanceCreate(service="toy", robot="walker")).id, timeout=10)
     records = {record.id: record for record in served.core.store.live()}
     assert records[old.id].key_id != records[new.id].key_id
-    assert records[new.id].key_id == Secrets(tmp_path).fingerprint
+    assert records[new.id].key_id == Secrets(tmp_path).fingerprint()
 
 
 def test_a_session_whose_key_is_gone_is_told_so(served: Any, tmp_path: Path) -> None:
@@ -171,8 +171,8 @@ def test_a_copy_holds_the_keys_of_sessions_that_run(tmp_path: Path) -> None:
     state = tmp_path / "state"
     state.mkdir()
     secrets = Secrets(state)
-    first = secrets.session_key(ID, secrets.fingerprint)
-    before = secrets.fingerprint
+    first = secrets.session_key(ID, secrets.fingerprint())
+    before = secrets.fingerprint()
     rotate_key(state)
     rotate_operator(state)
     backup(state, tmp_path / "copy")

@@ -511,7 +511,7 @@ def test_killed_at_any_call_of_the_provider_it_neither_leaks_nor_doubles(made: M
 class Deposed:
     """A lead that is lost when it is told to be."""
 
-    leads, epoch = True, 1
+    leads, epoch, elections = True, 1, 0
 
     def rise_above(self, epoch: int) -> None: ...
 

@@ -41,12 +41,9 @@ class Led:
     """A leadership with made-up time."""
 
     def __init__(self) -> None:
-        self.now, self.elected = 100.0, 0
+        self.now = 100.0
         self.lock = Held()
-        self.leadership = Leadership(self.lock, self._count, lambda: self.now)
-
-    def _count(self) -> None:
-        self.elected += 1
+        self.leadership = Leadership(self.lock, lambda: self.now)
 
 
 def test_whoever_has_the_lead_leads_for_less_than_it_lasts_and_begins_anew_when_it_was_late() -> None:
@@ -55,14 +52,14 @@ def test_whoever_has_the_lead_leads_for_less_than_it_lasts_and_begins_anew_when_
     assert (one.leadership.leads, one.leadership.epoch) == (False, 0)
     one.lock.epoch = 7
     delay = one.leadership.step()
-    assert (one.leadership.leads, one.leadership.epoch, one.elected) == (True, 7, 1)
+    assert (one.leadership.leads, one.leadership.epoch, one.leadership.elections) == (True, 7, 1)
     one.now += delay
     one.leadership.step()
-    assert one.elected == 1
+    assert one.leadership.elections == 1
     one.now += LEASE - delay
     assert (one.leadership.leads, one.leadership.epoch) == (False, 0), "before another one can lead"
     one.leadership.step()
-    assert (one.leadership.epoch, one.elected) == (7, 2), "nobody else took it; leases count anew all the same"
+    assert (one.leadership.epoch, one.leadership.elections) == (7, 2), "nobody else took it; leases count anew"
     one.lock.epoch = 0
     one.leadership.step()
     assert not one.leadership.leads
@@ -76,7 +73,7 @@ def test_leases_count_anew_before_the_next_one_who_leads_ends_anything_however_l
     b.step(2)
     b.clock.forward(1000)  # nobody led, and nobody could renew
     one, lock = Led(), b.store.lock()
-    one.leadership = Leadership(one.lock, lambda: b.leases.owe(), lambda: one.now)
+    one.leadership = Leadership(one.lock, lambda: one.now)
     one.lock.epoch = lock.hold()
     extend = b.store.extend_leases
 
@@ -171,7 +168,7 @@ def test_a_pass_that_began_before_its_orchestrator_led_does_nothing(
     b.sites.refresh = elected_meanwhile  # type: ignore[method-assign]
     b.placement.step()
     assert (one.leadership.leads, b.record().state) == (True, State.PENDING)
-    b.step(2)
+    b.step(3)  # in the first one leases count anew
     lock.release()
     assert (b.record().state, led) == (State.RUNNING, [one.leadership.epoch])
 
@@ -202,7 +199,7 @@ def test_a_site_that_has_heard_of_an_epoch_that_is_to_come_is_led_in_a_later_one
     lock = b.store.lock()
     first = lock.hold()
     b.clock.forward(first + 100 - b.clock())
-    leadership = Leadership(lock, lambda: b.leases.owe(), b.clock.steady)
+    leadership = Leadership(lock, b.clock.steady)
     b.led_by(leadership)
 
     def led_after_a_site_heard_of(epoch: int) -> int:
@@ -341,7 +338,7 @@ def test_a_site_that_hears_of_ever_later_epochs_begins_no_new_one_each_time(
     """It may be a machine that lies: with each epoch all leases count anew, and all sites are looked at anew."""
     b: Bench = bench()
     lock = b.store.lock()
-    leadership = Leadership(lock, lambda: b.leases.owe(), b.clock.steady)
+    leadership = Leadership(lock, b.clock.steady)
     epochs = set()
     for number in range(1, 100):
         leadership.step()

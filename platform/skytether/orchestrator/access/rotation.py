@@ -73,7 +73,7 @@ class Rotation:
 
     def agree(self) -> bool:
         """Whether the other orchestrators over this database have the same key, or one that this was before."""
-        return self._store.agree(FACT, self._secrets.fingerprint, self._secrets.old_fingerprints)
+        return self._store.agree(FACT, self._secrets.fingerprint(), self._secrets.old_fingerprints())
 
     def look(self) -> float:
         """Use what is new in the files, and forget keys that no session has any more; seconds until the next look."""
@@ -86,7 +86,7 @@ class Rotation:
                 self._told = str(error)
                 log.error("%s; those before are used on", error)
             return PERIOD_S
-        old = self._secrets.old_fingerprints
+        old = self._secrets.old_fingerprints()
         if old and self.agree():
             self._forget(old)
         return PERIOD_S

@@ -223,12 +223,10 @@ class Secrets:
         """Whether it is the one in ``metrics.token``."""
         return self._held.metrics is not None and self._held.metrics.matches(token)
 
-    @property
     def fingerprint(self) -> str:
         """By which orchestrators tell whether they have the same secret key; it tells nothing of the key."""
         return fingerprint_of(self._held.current)
 
-    @property
     def old_fingerprints(self) -> tuple[str, ...]:
         """Of the keys before, the oldest first."""
         return tuple(map(fingerprint_of, self._held.old))

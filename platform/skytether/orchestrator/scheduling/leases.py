@@ -64,11 +64,8 @@ class Leases:
         self._settles_at = -math.inf
         """Steady seconds: leases that others dated until then count anew, and none runs out before."""
         self._database_gone = False
-        self._owed = False
-
-    def owe(self) -> None:
-        """Before anything is ended for its lease, all count anew: nobody may have led, and nobody could renew."""
-        self._owed = True
+        self._elections = 0
+        """Of the lead, for which leases have counted anew: nobody may have led before, and nobody could renew."""
 
     def guarded(self, step: Callable[[], float]) -> float:
         """Wait where the database does not answer; once it does, leases count anew: nobody could renew meanwhile."""
@@ -113,8 +110,9 @@ class Leases:
                 self._settles_at = -math.inf
                 if self.leads():
                     self._store.extend_leases(now)  # what is about to end has another version then
-            if self._owed and self.leads():
-                self._owed = False  # first: it may be owed again meanwhile
+            elections = self._lead.elections
+            if elections != self._elections and self.leads():
+                self._elections = elections  # it may be elected again meanwhile
                 self._store.extend_leases(now)
                 self.times_set += 1
             if self._overload.owed() and self.leads():

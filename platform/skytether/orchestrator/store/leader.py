@@ -114,12 +114,17 @@ class Lead(Protocol):
         """As whose leader; 0: there can be no other one, or it does not lead."""
         ...
 
+    @property
+    def elections(self) -> int:
+        """How often it began to lead, or could not renew in time and leads on: nobody may have led before."""
+        ...
+
     def rise_above(self, epoch: int) -> None:
         """Lead on, if it leads, in an epoch after this one, of which a site has heard."""
 
 
 class _Alone:
-    leads, epoch = True, 0
+    leads, epoch, elections = True, 0, 0
 
     def rise_above(self, epoch: int) -> None:
         """There is no epoch."""
@@ -226,22 +231,21 @@ _NOT_HELD = 0, -1.0
 class Leadership:
     """Whether this orchestrator acts. ``step`` is called again and again by a loop of its own."""
 
-    def __init__(self, lock: Lock, on_elected: Callable[[], None], steady: Callable[[], float] = boottime) -> None:
+    def __init__(self, lock: Lock, steady: Callable[[], float] = boottime) -> None:
         """Not leading yet.
 
         Args:
             lock: What the leader has.
-            on_elected: Called, in the loop's thread, before this one begins to lead, and where it could not renew in
-                time and leads on. It must return at once: the lead is not renewed meanwhile.
             steady: Seconds of a clock that nobody sets and that goes on while the machine sleeps.
         """
         self._lock = lock
-        self._on_elected = on_elected
         self._steady = steady
         self._rises = RateLimiter(_RISES_PER_S, _RISES, steady)
         self._held = _NOT_HELD
         """Epoch, and until when it takes itself for the leader; both at once, for other threads read them."""
         self._above = 0
+        self.elections = 0
+        """See ``Lead``; counted before it leads."""
 
     @property
     def leads(self) -> bool:
@@ -270,7 +274,7 @@ class Leadership:
             self._held = _NOT_HELD
             return _LOOK
         if epoch != before or not led:
-            self._on_elected()
+            self.elections += 1
         if epoch != before:
             log.info("this orchestrator leads: it places, starts and stops instances (epoch %d)", epoch)
         self._held = epoch, sent + _BELIEVED
