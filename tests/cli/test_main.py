@@ -14,7 +14,7 @@ from skytether.cli.commands.demo import _told
 from skytether.cli.commands.robot.check import show
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Source
-from skytether.robot.control.control_loop import Transition
+from skytether.robot.control.control_status import Transition
 from skytether.robot.graphs.finding import Finding
 
 

@@ -18,7 +18,7 @@ from ..output import console, fail, print_json, silenced
 
 if TYPE_CHECKING:
     from skytether.lab.demo import Demo, DemoResult
-    from skytether.robot.control.control_loop import Transition
+    from skytether.robot.control.control_status import Transition
 
 
 def demo(

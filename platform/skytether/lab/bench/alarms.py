@@ -19,7 +19,7 @@ import numpy as np
 from skytether.robot.agent.agent import Agent
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Command, Source
-from skytether.robot.control.control_loop import ControlStatus
+from skytether.robot.control.control_status import ControlStatus
 
 from .failover import LEARN_S, Granted, Wheels, bench_config, start_link, start_service, wait_for
 

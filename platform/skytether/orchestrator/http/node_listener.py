@@ -343,45 +343,60 @@ class NodeListener:
         if isinstance(request, Way):
             await self._bring(request, name, certificate, connection, (reader, writer))
             return None
+        self._spend(request, name)
+        with self._one_of(name):
+            answer = await self._answer_node(request, name, certificate, connection, writer)
+        if not isinstance(answer, LinkedNode):
+            return answer
+        why = "the orchestrator ended the link"
+        try:
+            why = await self._ways.serve(answer, reader)
+        finally:
+            self._ways.end(answer, why)
+        return None
+
+    def _spend(self, request: Request, name: str) -> None:
+        """Take a request of what a node may ask."""
         wait = self._requests.wait(name)
         if isinstance(request, Link | Renew):
             wait = max(wait, self._links.wait(name))
         if wait:
             raise TooManyError(wait)
-        with self._one_of(name):
-            try:
-                known = await asyncio.to_thread(self._enrolment.admit, certificate)
-            except RemovedError:
-                if not isinstance(request, Leave | Standing):
-                    raise
-                if self._ways.get(name) is None:
-                    return Stands(state="gone")
-                return Stands(state="blocked", reason="what is left here is being removed", draining=True)
-            connection.know(f"node:{name}")
-            if isinstance(request, Renew):
-                issued = await asyncio.to_thread(self._enrolment.renew, known, request.request)
-                self._note(request, connection, "", name)
-                return issued
-            if known.ended:
-                text = "this certificate is over: it may be renewed, and nothing else"
-                return Refused(error=text, final=False, over=True)
-            if isinstance(request, Standing):
-                stands = await asyncio.to_thread(self._standing, name)
-                echo = None if stands.state == "gone" else await self._echoes.answers(name)
-                return stands.model_copy(update={"seen_as": connection.host, "echo": echo})
-            if isinstance(request, Leave):
-                stands = await asyncio.to_thread(self._leave, name, request.force)
-                self._note(request, connection, "", name)
-                return stands
-            node = await self._link(request, known, connection, writer)
-        if isinstance(node, Refused):
-            return node
-        why = "the orchestrator ended the link"
+
+    async def _answer_node(
+        self,
+        request: Leave | Link | Renew | Standing,
+        name: str,
+        certificate: x509.Certificate,
+        connection: _NodeConnection,
+        writer: asyncio.StreamWriter,
+    ) -> Strict | LinkedNode:
+        """What is said to a node that joined; or its link, which has begun."""
         try:
-            why = await self._ways.serve(node, reader)
-        finally:
-            self._ways.end(node, why)
-        return None
+            known = await asyncio.to_thread(self._enrolment.admit, certificate)
+        except RemovedError:
+            if not isinstance(request, Leave | Standing):
+                raise
+            if self._ways.get(name) is None:
+                return Stands(state="gone")
+            return Stands(state="blocked", reason="what is left here is being removed", draining=True)
+        connection.know(f"node:{name}")
+        if isinstance(request, Renew):
+            issued = await asyncio.to_thread(self._enrolment.renew, known, request.request)
+            self._note(request, connection, "", name)
+            return issued
+        if known.ended:
+            text = "this certificate is over: it may be renewed, and nothing else"
+            return Refused(error=text, final=False, over=True)
+        if isinstance(request, Standing):
+            stands = await asyncio.to_thread(self._standing, name)
+            echo = None if stands.state == "gone" else await self._echoes.answers(name)
+            return stands.model_copy(update={"seen_as": connection.host, "echo": echo})
+        if isinstance(request, Leave):
+            stands = await asyncio.to_thread(self._leave, name, request.force)
+            self._note(request, connection, "", name)
+            return stands
+        return await self._link(request, known, connection, writer)
 
     @contextlib.contextmanager
     def _one_of(self, name: str) -> Iterator[None]:

@@ -10,7 +10,7 @@ from skytether.api import rest
 from skytether.ros.followed import Followed
 from skytether.wire.stats import SessionStats
 
-from ..control.control_loop import ControlStatus
+from ..control.control_status import ControlStatus
 from ..graphs.wheels_watch import NOBODY, Others
 from ..offload.task_manager import OffloadDecision
 from ..session.counter_totals import COUNTERS, CounterTotals

@@ -21,8 +21,9 @@ from skytether.orchestrator.runtimes.docker.engine import EngineGoneError
 from skytether.orchestrator.runtimes.docker.follow import Follower
 from skytether.orchestrator.runtimes.docker.launch import Job
 from skytether.orchestrator.runtimes.docker.namespaces import Namespaces
-from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER, ContainerState, Helper, Namespace
+from skytether.orchestrator.runtimes.docker.objects import INSTANCE, OWNER, Namespace
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.seen import ContainerState, Helper
 
 PATIENCE = 10.0
 

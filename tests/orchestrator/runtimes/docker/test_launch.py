@@ -16,8 +16,8 @@ from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker import launch as docker_launch
 from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.launch import Job
-from skytether.orchestrator.runtimes.docker.objects import ContainerState
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.seen import ContainerState
 
 PATIENCE = 10.0
 

@@ -36,7 +36,6 @@ from skytether.orchestrator.runtimes.docker.limits import ContainerLimits, limit
 from skytether.orchestrator.runtimes.docker.meter import Usage, usage_of
 from skytether.orchestrator.runtimes.docker.network import bridge_of
 from skytether.orchestrator.runtimes.docker.objects import (
-    ContainerState,
     Declared,
     Namespace,
     advised,
@@ -48,12 +47,10 @@ from skytether.orchestrator.runtimes.docker.objects import (
     grant_archive,
     guard,
     holder,
-    observation,
-    parse,
-    parse_helper,
     refusal,
 )
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.seen import ContainerState, observation, parse, parse_helper
 
 KEY = base64.b64encode(bytes(range(32))).decode()
 ROOT = Path(__file__).parents[4]

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from skytether.orchestrator.runtimes.base import Phase, RuntimeFailure
-from skytether.orchestrator.runtimes.docker.objects import ContainerState, observation, parse
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.seen import ContainerState, observation, parse
 from skytether.orchestrator.runtimes.docker.volumes import Scales, sizes
 
 DISK = {

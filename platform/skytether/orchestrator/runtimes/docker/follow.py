@@ -26,7 +26,8 @@ from ..base import RuntimeFailure
 from ..containers import last_line
 from .engine import Engine, EngineGoneError, root_cause
 from .meter import Meter
-from .objects import INSTANCE, OWNER, READY, ContainerState, Helper, carried_over, parse, parse_helper, pull_machine
+from .objects import INSTANCE, OWNER, READY
+from .seen import ContainerState, Helper, carried_over, parse, parse_helper, pull_machine
 
 log = logging.getLogger(__name__)
 

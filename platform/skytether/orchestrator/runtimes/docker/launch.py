@@ -23,20 +23,9 @@ from .follow import Follower
 from .images import ensure_image
 from .namespaces import Namespaces
 from .network import close_off, guard_image, is_ours
-from .objects import (
-    OWNER,
-    ContainerState,
-    Namespace,
-    advised,
-    container,
-    declared,
-    free_gpus,
-    free_port,
-    grant_archive,
-    name_of,
-    parse,
-)
+from .objects import OWNER, Namespace, advised, container, declared, free_gpus, free_port, grant_archive, name_of
 from .options import DockerOptions
+from .seen import ContainerState, parse
 
 log = logging.getLogger(__name__)
 

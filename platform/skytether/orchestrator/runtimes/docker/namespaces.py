@@ -23,8 +23,9 @@ from ..base import RuntimeFailure
 from .engine import Engine
 from .follow import Follower
 from .network import close_off, guard_image, is_ours
-from .objects import Namespace, holder, published_port
+from .objects import Namespace, holder
 from .options import DockerOptions
+from .seen import published_port
 
 log = logging.getLogger(__name__)
 

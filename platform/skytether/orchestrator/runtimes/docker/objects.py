@@ -1,4 +1,4 @@
-"""What is asked of an engine, and what its answers mean: pure, data in and data out."""
+"""What is asked of an engine: pure, data in and data out. What its answers mean is in `seen`."""
 
 from __future__ import annotations
 
@@ -6,27 +6,23 @@ import io
 import posixpath
 import tarfile
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from skytether.api.grant import GRANT_VARIABLE
 from skytether.api.manifest import ServiceSpec
-from skytether.api.service_report import FILE_NAME, ServiceReport
+from skytether.api.service_report import FILE_NAME
 
-from ..base import Launch, Observation, Phase, RuntimeFailure
+from ..base import Launch, RuntimeFailure
 from ..containers import (
     INNER_PORT,
     USER,
     data_name,
-    exit_status,
     image_refusal,
-    last_line,
-    out_of_memory,
 )
 from ..egress import refusal_of
-from .limits import NO_LIMITS, ContainerLimits, limits_of, parent_of, pull_limits
-from .meter import Usage
+from .limits import limits_of, parent_of
 from .options import DockerOptions
 
 _ROOT = "/run/skytether"
@@ -36,6 +32,8 @@ GRANT = f"{_ROOT}/{_OWN}/grant.json"
 READY = f"{_ROOT}/{_OWN}/ready.json"
 REPORTS = f"{_ROOT}/{_OWN}/{FILE_NAME}"
 _DATA = "data"
+DATA_FOLDER = f"{_ROOT}/{_DATA}"
+"""Where the volume is for what a service writes."""
 _LOG = {"max-size": "2m", "max-file": "2"}
 """The engine keeps at most this of each run's log."""
 _TMP = "/tmp"  # noqa: S108 (the container's own)
@@ -43,22 +41,20 @@ _TMPFS = "size=64m,mode=1777,nosuid,nodev"
 """Of /tmp; it counts as memory of the container."""
 _PREFIX = "skytether.io"
 OWNER = f"{_PREFIX}/owner"
-INSTANCE, _ATTEMPT, _GPUS = f"{_PREFIX}/instance", f"{_PREFIX}/attempt", f"{_PREFIX}/gpus"
-_NAMESPACE, _PORT = f"{_PREFIX}/namespace", f"{_PREFIX}/port"
+INSTANCE, ATTEMPT, GPUS = f"{_PREFIX}/instance", f"{_PREFIX}/attempt", f"{_PREFIX}/gpus"
+NAMESPACE, PORT = f"{_PREFIX}/namespace", f"{_PREFIX}/port"
 """Of an instance in a network that was prepared: the container that holds it, and the UDP port published there."""
 EPOCH = f"{_PREFIX}/epoch"
 """Of containers: of the leader who had them made. Of volumes: who led here last."""
-_HELPER = f"{_PREFIX}/helper"
+HELPER = f"{_PREFIX}/helper"
 """Of the other containers of ours: whom a guard closes off, and nobody where it holds a network namespace."""
-_INNER = f"{INNER_PORT}/udp"
-_EXPOSED: dict[str, dict[str, str]] = {_INNER: {}}
+INNER = f"{INNER_PORT}/udp"
+_EXPOSED: dict[str, dict[str, str]] = {INNER: {}}
 _MANAGED = {"app.kubernetes.io/managed-by": "skytether"}
 _HELPS = {"ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode": "none"}
 """Of whom no service is asked."""
 _MOST_VOLUMES = 32
 """That an image may declare: an engine makes, mounts and removes each of them, and answers nobody meanwhile."""
-_LONGEST = 200
-"""Characters of a word that an engine says of itself, and words of a list."""
 _LEAST_BETWEEN_CHECKS = {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}
 """Nanoseconds between two checks of an image's health: each costs the engine more than the container, whose limits do
 not hold for that."""
@@ -80,52 +76,6 @@ class Namespace:
     """Of that container."""
     port: int
     """Published UDP port."""
-
-
-@dataclass(frozen=True, slots=True)
-class Helper:
-    """A container of ours that is no service."""
-
-    name: str
-    runs: bool
-    target: str
-    """The container that this guard closes off; empty: it is no guard, and holds a network namespace."""
-
-
-@dataclass(frozen=True, slots=True)
-class ContainerState:
-    """One container of ours as the engine describes it."""
-
-    id: str
-    instance: str
-    attempt: int
-    status: str
-    """``created``, ``running``, ``paused``, ``exited``, ``dead``, ``removing``."""
-    exit_code: int = 0
-    out_of_memory: bool = False
-    limits: ContainerLimits = NO_LIMITS
-    host_port: int | None = None
-    """Published UDP port; known while it runs."""
-    ill: str = ""
-    """What its health check says, when that has failed for good."""
-    gpus: frozenset[int] = frozenset()
-    volume: str = ""
-    """That of its data."""
-    other_volumes: tuple[str, ...] = ()
-    namespace: str = ""
-    """The container that holds its network; empty: it does itself."""
-    ready: bool = False
-    """Its ready file was seen."""
-    last_line: str = ""
-    """When it has ended."""
-
-    @property
-    def runs(self) -> bool:
-        return self.status in ("running", "paused")
-
-    @property
-    def ended(self) -> bool:
-        return self.status in ("exited", "dead", "removing")
 
 
 def name_of(owner: str, instance: str, attempt: int) -> str:
@@ -249,7 +199,7 @@ def container(
     spec, grant = launch.spec, launch.grant
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
-    paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, f"{_ROOT}/{_DATA}", _TMP}
+    paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, DATA_FOLDER, _TMP}
     return {
         "Image": image.id,
         # The rest of the check stays the image's.
@@ -259,10 +209,10 @@ def container(
         **({} if namespace else {"ExposedPorts": _EXPOSED}),
         "Labels": {
             OWNER: owner,
-            **({_NAMESPACE: namespace.id, _PORT: str(namespace.port)} if namespace else {}),
+            **({NAMESPACE: namespace.id, PORT: str(namespace.port)} if namespace else {}),
             INSTANCE: grant.instance,
-            _ATTEMPT: str(launch.attempt),
-            _GPUS: ",".join(map(str, gpus)),
+            ATTEMPT: str(launch.attempt),
+            GPUS: ",".join(map(str, gpus)),
             **({EPOCH: str(epoch)} if epoch else {}),
             "app.kubernetes.io/name": grant.service,
             "app.kubernetes.io/instance": grant.instance,
@@ -284,7 +234,7 @@ def container(
                     _volume(path, {OWNER: owner, INSTANCE: grant.instance, **_MANAGED})
                     for path in [_ROOT, *sorted(paths)]
                 ),
-                _volume(f"{_ROOT}/{_DATA}", {OWNER: owner, **whose}, data_volume(owner, launch)),
+                _volume(DATA_FOLDER, {OWNER: owner, **whose}, data_volume(owner, launch)),
             ],
             "Devices": [
                 {"PathOnHost": device, "PathInContainer": device, "CgroupPermissions": "rw"}
@@ -310,7 +260,7 @@ def _reached(options: DockerOptions, port: int | None, hosts: Mapping[str, Itera
     """How a container is reached, and whom it knows by name."""
     return {
         "NetworkMode": options.network,
-        "PortBindings": {_INNER: [{"HostIp": options.bound, "HostPort": str(port or "")}]},
+        "PortBindings": {INNER: [{"HostIp": options.bound, "HostPort": str(port or "")}]},
         "Dns": ["127.0.0.1"],  # nobody to ask: names would be a way out
         "ExtraHosts": [f"{name}:{address}" for name, addresses in hosts.items() for address in addresses],
     }
@@ -325,7 +275,7 @@ def holder(options: DockerOptions, owner: str, image: str) -> dict[str, Any]:
         "User": f"{USER}:{USER}",
         "ExposedPorts": _EXPOSED,
         "HostConfig": {**_reached(options, None, {}), **_HELPS, "CapDrop": ["ALL"], "SecurityOpt": options.security},
-        "Labels": {OWNER: owner, _HELPER: "", **_MANAGED},
+        "Labels": {OWNER: owner, HELPER: "", **_MANAGED},
     }
 
 
@@ -343,7 +293,7 @@ def guard(options: DockerOptions, owner: str, image: str, target: str, script: s
             "CapAdd": ["NET_ADMIN"],
             "SecurityOpt": options.security,
         },
-        "Labels": {OWNER: owner, _HELPER: target, **_MANAGED},
+        "Labels": {OWNER: owner, HELPER: target, **_MANAGED},
     }
 
 
@@ -375,128 +325,3 @@ def _owned(path: str, mode: int, kind: bytes) -> tarfile.TarInfo:
     entry = tarfile.TarInfo(path)
     entry.type, entry.mode, entry.uid, entry.gid = kind, mode, USER, USER
     return entry
-
-
-def pull_machine(info: Any) -> Mapping[str, Any]:
-    """What an engine says of itself, of the kinds that are reckoned with here, and short.
-
-    Raises:
-        ValueError: Some of it is of another kind.
-    """
-    if not isinstance(info, Mapping):
-        raise ValueError("it says nothing of itself")
-    kinds = {"NCPU": (int, float), "MemTotal": (int,), "Architecture": (str,), "SystemTime": (str,)}
-    for key, kind in kinds.items():
-        value = info.get(key, "")
-        if not isinstance(value, kind) or len(str(value)) > _LONGEST:
-            raise ValueError(f"its {key} is not what it should be")
-    security = info.get("SecurityOptions") or ()
-    if not isinstance(security, list | tuple) or len(security) > _LONGEST or not all(_is_word(row) for row in security):
-        raise ValueError("its SecurityOptions are not what they should be")
-    return info
-
-
-def _is_word(value: object) -> bool:
-    return isinstance(value, str) and len(value) <= _LONGEST
-
-
-def parse(inspected: Mapping[str, Any]) -> ContainerState | None:
-    """A container out of the engine's description; None: it is not one of ours."""
-    labels = inspected["Config"].get("Labels") or {}
-    if INSTANCE not in labels or not labels.get(_ATTEMPT, "").isdecimal():
-        return None
-    state = inspected["State"]
-    port = published_port(inspected)
-    health = state.get("Health") or {}
-    volumes = {mount.get("Destination"): str(mount.get("Name", "")) for mount in inspected.get("Mounts") or ()}
-    return ContainerState(
-        id=inspected["Id"],
-        instance=labels[INSTANCE],
-        attempt=int(labels[_ATTEMPT]),
-        status=state["Status"],
-        exit_code=state["ExitCode"],
-        out_of_memory=state["OOMKilled"],
-        limits=pull_limits(inspected["HostConfig"]),
-        host_port=port or (_port(labels[_PORT]) if labels.get(_PORT, "").isdecimal() else None),
-        ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
-        gpus=frozenset(int(number) for number in labels.get(_GPUS, "").split(",") if number.isdecimal()),
-        volume=volumes.pop(f"{_ROOT}/{_DATA}", ""),
-        other_volumes=tuple(volumes.values()),
-        namespace=labels.get(_NAMESPACE, ""),
-    )
-
-
-def published_port(inspected: Mapping[str, Any]) -> int | None:
-    """Where a container is reached on its engine's machine; None: nowhere, or its network is another's."""
-    published = (inspected["NetworkSettings"].get("Ports") or {}).get(_INNER) or []
-    return _port(published[0]["HostPort"]) if published else None
-
-
-def _port(told: Any) -> int | None:
-    """A robot is sent there, so it is one, or none."""
-    port = int(told)
-    return port if 0 < port < 1 << 16 else None
-
-
-def parse_helper(inspected: Mapping[str, Any]) -> Helper | None:
-    """A guard, or what holds a network; None: it is neither."""
-    target = (inspected["Config"].get("Labels") or {}).get(_HELPER)
-    if target is None:
-        return None
-    return Helper(inspected["Name"].removeprefix("/"), inspected["State"]["Status"] in ("running", "paused"), target)
-
-
-def _complaint(log: Sequence[Mapping[str, Any]]) -> str:
-    """What the last check said; empty: it did not end in time, for which a busy machine is enough."""
-    if log and log[-1].get("ExitCode", 0) < 0:
-        return ""
-    said = last_line(str(log[-1].get("Output", ""))) if log else ""
-    return said or "its health check fails"
-
-
-def carried_over(new: ContainerState, old: ContainerState | None) -> ContainerState:
-    """What one look knows that the next cannot find out again."""
-    if old is None:
-        return new
-    return replace(
-        new,
-        ready=new.ready or old.ready,
-        host_port=new.host_port or old.host_port,
-        last_line=new.last_line or old.last_line,
-    )
-
-
-def observation(
-    seen: ContainerState,
-    options: DockerOptions,
-    usage: Usage | None = None,
-    exceeds: str = "",
-    *,
-    cut_off: bool = False,
-    reports: tuple[ServiceReport, ...] = (),
-    step_s: float | None = None,
-) -> Observation:
-    """What the contract calls it; ``exceeds``: what it wrote too much of; ``cut_off``: its network is held no more."""
-    if seen.ended:
-        return Observation(
-            seen.attempt,
-            Phase.EXITED,
-            exit_status=exit_status(seen.exit_code),
-            last_line=seen.last_line,
-            detail=_how_it_ended(seen),
-            out_of_memory=bool(_how_it_ended(seen)),
-            reports=reports,
-        )
-    if seen.runs and seen.ready and seen.host_port is not None:
-        used = asdict(usage) if usage is not None else {}
-        where = options.advertised, seen.host_port
-        ill = "the container that held its network has ended" if cut_off else seen.ill
-        told: dict[str, Any] = {"detail": ill, "exceeds": exceeds, "reports": reports, "step_s": step_s}
-        return Observation(seen.attempt, Phase.RUNNING, where[0], where[1], **told, **used)
-    return Observation(seen.attempt, Phase.STARTING, exceeds=exceeds, reports=reports)
-
-
-def _how_it_ended(seen: ContainerState) -> str:
-    if seen.out_of_memory and seen.exit_code:
-        return out_of_memory(seen.limits.memory >> 20)
-    return ""

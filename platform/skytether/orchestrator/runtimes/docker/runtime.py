@@ -39,9 +39,10 @@ from .limits import limits_of
 from .logs import ContainerLog
 from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
-from .objects import ContainerState, data_volume, observation, refusal
+from .objects import data_volume, refusal
 from .options import DockerOptions
 from .reports import ReportReader
+from .seen import ContainerState, observation
 from .volumes import Scales, remove_left
 
 log = logging.getLogger(__name__)
