@@ -440,7 +440,7 @@ def run(asked: argparse.Namespace, client: docker.DockerClient, pusher: Pusher |
     pushed = [pusher.tag(name, _tags(asked.tag, made_from[name])) for name in names if made_from[name]]
     if asked.digests:
         asked.digests.write_text(yaml.safe_dump(values(pushed), sort_keys=False))
-    _tell(pushed, as_json=asked.json)
+    _print_pushed(pushed, as_json=asked.json)
 
 
 def _tags(asked: str, made_from: list[str]) -> list[str]:
@@ -450,7 +450,7 @@ def _tags(asked: str, made_from: list[str]) -> list[str]:
     return {SOURCE: [source], TAG: [TAG, version, source]}.get(asked, [asked, source])
 
 
-def _tell(pushed: list[Pushed], *, as_json: bool) -> None:
+def _print_pushed(pushed: list[Pushed], *, as_json: bool) -> None:
     if as_json:
         print(json.dumps([asdict(row) for row in pushed], indent=2))
     for row in pushed:

@@ -81,9 +81,9 @@ class PlainRuntime(Runtime):
 
     def observe(self) -> Mapping[str, Observation]:
         runs = {path.parent.name: read(path) for path in self._folder.glob("*/run.json")}
-        return {instance: self._look(instance, run) for instance, run in runs.items()}
+        return {instance: self._observe(instance, run) for instance, run in runs.items()}
 
-    def _look(self, instance: str, run: dict[str, Any]) -> Observation:
+    def _observe(self, instance: str, run: dict[str, Any]) -> Observation:
         folder, attempt = self._folder / instance, run["attempt"]
         reports = pull_reports(read(folder / FILE_NAME))
         if self._process(run) is None:

@@ -100,7 +100,7 @@ class Orchestrator:
         self._shared_clock = SharedClock(self.store.now, boottime, time.time) if self.store.served else None
         clock = self.clock = clock or self._shared_clock or time.time
         self.rotation = Rotation(settings.secrets_dir or settings.state_dir, secrets, self.store, clock)
-        self.keeper = Loop("secrets", self._unless_outdated(self.rotation.look), time.monotonic)
+        self.keeper = Loop("secrets", self._unless_outdated(self.rotation.refresh), time.monotonic)
         self.sites = Sites(settings.state_dir / "sites", self.store, settings.timing, find_runtime)
         self.disk_usage = DiskUsage(self.sites.stored, settings.quotas, self.sites.hosted)
         self.quotas = Quotas(self.store, settings.quotas, self.disk_usage)
@@ -242,7 +242,7 @@ class Orchestrator:
         declared, groups = (read_sites(file), read_groups(file)) if file else ([], [])
         self.store.migrate()
         if self._shared_clock is not None:
-            self._shared_clock.look()
+            self._shared_clock.sync()
         if not self.rotation.agree():
             raise SecretFileError(
                 "the database belongs to orchestrators with another secret.key: give this one the same (--secrets-dir)"
@@ -281,7 +281,7 @@ class Orchestrator:
         delay = self.leadership.step()
         if self._shared_clock is not None:
             with contextlib.suppress(*GONE):
-                self._shared_clock.look()
+                self._shared_clock.sync()
         return delay
 
     def _unless_outdated(self, step: Callable[_Args, float]) -> Callable[_Args, float]:

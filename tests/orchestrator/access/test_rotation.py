@@ -26,10 +26,10 @@ CLAIM = "c" * 43
 def test_sessions_keep_their_key_and_new_ones_have_another(tmp_path: Path) -> None:
     secrets = Secrets(tmp_path)
     before, first = secrets.fingerprint(), secrets.session_key(ID)
-    assert not secrets.look()
+    assert not secrets.reload()
     kept = rotate_key(tmp_path)
     assert kept.stat().st_mode & 0o777 == 0o600
-    assert secrets.look()
+    assert secrets.reload()
     assert secrets.fingerprint() != before
     assert secrets.old_fingerprints() == (before,)
     assert secrets.session_key(ID, before) == first
@@ -45,7 +45,7 @@ def test_sessions_keep_their_key_and_new_ones_have_another(tmp_path: Path) -> No
 def test_a_session_of_a_key_that_another_orchestrator_saw_first(tmp_path: Path) -> None:
     slow, quick = Secrets(tmp_path), Secrets(tmp_path)
     rotate_key(tmp_path)
-    quick.look()
+    quick.reload()
     assert slow.session_key(ID, quick.fingerprint()) == quick.session_key(ID, quick.fingerprint())
 
 
@@ -55,7 +55,7 @@ def test_what_cannot_be_used_changes_nothing(tmp_path: Path, caplog: pytest.LogC
     before = secrets.fingerprint()
     (tmp_path / "secret.key").rename(tmp_path / "away")
     for _ in range(3):
-        rotation.look()
+        rotation.refresh()
     assert secrets.fingerprint() == before
     assert not (tmp_path / "secret.key").exists(), "no other one is made while sessions run"
     assert caplog.text.count("secret.key is gone: put it back") == 1
@@ -75,11 +75,11 @@ def test_a_key_that_could_not_be_used_is_once_it_is_mended(
     (tmp_path / "copy").chmod(0o644)
     (tmp_path / "copy").replace(tmp_path / "secret.key")
     for _ in range(3):
-        rotation.look()
+        rotation.refresh()
     assert secrets.fingerprint() == before
     assert caplog.text.count("can be read by others: chmod 600") == 1
     (tmp_path / "secret.key").chmod(0o600)
-    assert secrets.look()
+    assert secrets.reload()
     assert secrets.fingerprint() == fingerprint_of(b"k" * 32)
 
 
@@ -117,7 +117,7 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(
     assert record.key_id == first
     old = rotate_key(folder)
     ahead[0] = 120.0
-    rotation.look()
+    rotation.refresh()
     assert old.exists(), "an instance has it"
     assert Rotation(folder, Secrets(folder), store, time.time).agree(), "and so does an orchestrator that starts now"
     stranger = tmp_path / "stranger"
@@ -125,12 +125,12 @@ def test_an_old_key_is_forgotten_when_no_session_has_it(
     assert not Rotation(stranger, Secrets(stranger), store, time.time).agree()
     assert store.change(Change(record, {"state": State.STOPPED}), 1_700_000_001.0)
     ahead[0] = 0.0
-    rotation.look()
+    rotation.refresh()
     assert old.exists(), "another orchestrator may not have seen the rotation"
     ahead[0] = 120.0
-    rotation.look()
+    rotation.refresh()
     assert not old.exists()
-    rotation.look()
+    rotation.refresh()
     assert secrets.old_fingerprints() == ()
     assert caplog.text.count("were changed") == 1, "at the rotation, and not where a key was forgotten"
 
@@ -143,7 +143,7 @@ def test_nothing_ends_where_secrets_are_rotated(served: Any, tmp_path: Path) -> 
     runs = CliRunner()
     for what in ("secret-key", "operator-token"):
         assert runs.invoke(app, ["orchestrator", "rotate", what, "--state-dir", str(tmp_path)]).exit_code == 0
-    served.core.rotation.look()
+    served.core.rotation.refresh()
     with pytest.raises(ApiError, match="not known here"):
         served.operator.sites()
     served.token = (tmp_path / "operator.token").read_text().strip()
@@ -161,7 +161,7 @@ def test_a_session_whose_key_is_gone_is_told_so(served: Any, tmp_path: Path) -> 
     asks = served.operator
     one = asks.wait_running(asks.create_instance(InstanceCreate(service="toy", robot="walker")).id, timeout=10)
     rotate_key(tmp_path).unlink()
-    served.core.rotation.look()
+    served.core.rotation.refresh()
     with pytest.raises(ApiError, match="put it back, or delete instance") as told:
         asks.claim_session(one.id, CLAIM)
     assert told.value.problem.status == 409

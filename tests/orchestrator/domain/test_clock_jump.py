@@ -104,7 +104,7 @@ def test_ended_instances_are_kept_for_their_time_by_the_databases_clock_not_by_t
 ) -> None:
     """One that the leader ended, and one that another orchestrator ended, whose machine's clock is right."""
     shared: Any = SharedClock(clock, clock.steady, lambda: clock() + by)
-    shared.look()
+    shared.sync()
     shared.steady = clock.steady
     b = Bench(tmp_path, store, shared)
     b.led_by(b.lead, ServerLimits())

@@ -37,7 +37,7 @@ def test_a_renewed_certificate_takes_the_place_of_one_of_another_kind_of_key(tmp
     live = LiveCertificate(cert, key)
     assert shown(live) == in_file(cert)
     certificate(tmp_path, ed=True)
-    live.look()
+    live.reload()
     assert shown(live) == in_file(cert)
 
 
@@ -52,10 +52,10 @@ def test_a_key_that_others_can_read_is_refused(tmp_path: Path, mode: int) -> Non
     before = shown(live)
     certificate(tmp_path)
     key.chmod(mode)
-    live.look()
+    live.reload()
     assert shown(live) == before
     key.chmod(0o600)
-    live.look()
+    live.reload()
     assert shown(live) == in_file(cert)
 
 
@@ -64,7 +64,7 @@ def test_a_pipe_in_place_of_a_key_holds_up_nobody(tmp_path: Path) -> None:
     live = LiveCertificate(cert, key)
     key.unlink()
     os.mkfifo(key, 0o600)
-    live.look()
+    live.reload()
     assert shown(live) == in_file(cert)
     with pytest.raises(SecretFileError, match="is no file"):
         LiveCertificate(cert, key)

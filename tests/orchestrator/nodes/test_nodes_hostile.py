@@ -126,8 +126,10 @@ def test_a_node_that_talks_without_end_is_heard_only_now_and_then(
     """All nodes are served by one loop, and each line takes its time: others were not linked any more."""
     monkeypatch.setattr(ways, rate, 0.01)
     monkeypatch.setattr(ways, most, 5)
-    heard, hear = [], ways.Ways._hear  # noqa: SLF001 what is not heard shows nowhere
-    monkeypatch.setattr(ways.Ways, "_hear", lambda own, node, said: (heard.append(said), hear(own, node, said)))
+    heard, on_message = [], ways.Ways._on_message  # noqa: SLF001 what is not heard shows nowhere
+    monkeypatch.setattr(
+        ways.Ways, "_on_message", lambda own, node, said: (heard.append(said), on_message(own, node, said))
+    )
     nodes.shut()
     nodes.open()
     nodes.join("edge")

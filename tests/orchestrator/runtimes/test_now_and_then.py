@@ -14,12 +14,12 @@ def test_it_is_not_called_oftener_than_it_is_due_and_never_twice_at_once() -> No
     began, go_on = threading.Semaphore(0), threading.Semaphore(0)
     ended: list[float] = []
 
-    def look() -> None:
+    def poll() -> None:
         began.release()
         assert go_on.acquire(timeout=PATIENCE)
         ended.append(now[0])
 
-    looks = NowAndThen("a test", 10.0, lambda: now[0], look)
+    looks = NowAndThen("a test", 10.0, lambda: now[0], poll)
 
     def of_these() -> list[threading.Thread]:
         return [thread for thread in threading.enumerate() if thread.name == "a test"]

@@ -302,7 +302,7 @@ def test_the_clock_of_a_database_is_carried_on_by_one_that_nobody_sets(caplog: p
     steady, said, own = [50.0], [1000.0], [4600.0]
     clock = SharedClock(lambda: said[0], lambda: steady[0], lambda: own[0])
     assert clock() == 4600.0
-    clock.look()
+    clock.sync()
     assert clock() == 1000.0
     assert "this machine's clock is 3600 s ahead of the database's" in caplog.text
     caplog.clear()
@@ -310,7 +310,7 @@ def test_the_clock_of_a_database_is_carried_on_by_one_that_nobody_sets(caplog: p
     own[0] -= 9000
     assert clock() == 1007.0, "nobody sets it"
     said[0] += 7
-    clock.look()
+    clock.sync()
     assert "behind" in caplog.text
 
 
@@ -323,12 +323,12 @@ def test_an_answer_that_took_long_moves_the_clock_no_further_than_it_must() -> N
         return said[0]
 
     clock = SharedClock(asked, lambda: steady[0], lambda: 1000.0)
-    clock.look()
+    clock.sync()
     took[0], said[0] = 4.0, 1001.0  # it was asked at 1000 and answered by 1004
-    clock.look()
+    clock.sync()
     assert clock() == 1004.0
     took[0], said[0] = 0.0, 1004.5
-    clock.look()
+    clock.sync()
     assert clock() == 1004.5
 
 

@@ -75,10 +75,10 @@ class Rotation:
         """Whether the other orchestrators over this database have the same key, or one that this was before."""
         return self._store.agree(FACT, self._secrets.fingerprint(), self._secrets.old_fingerprints())
 
-    def look(self) -> float:
+    def refresh(self) -> float:
         """Use what is new in the files, and forget keys that no session has any more; seconds until the next look."""
         try:
-            if self._secrets.look():
+            if self._secrets.reload():
                 log.info("the secrets in %s were changed, and are used from now on", self._folder)
             self._told = ""
         except SecretFileError as error:

@@ -53,7 +53,7 @@ class SharedClock:
         """Seconds since the epoch."""
         return self._steady() + self._offset
 
-    def look(self) -> None:
+    def sync(self) -> None:
         """Ask the database; raises what its driver raises.
 
         What it says was true at some moment between question and answer: the offset stays if it can be so.

@@ -59,14 +59,14 @@ class Overload:
             yield
         finally:
             with self._lock:
-                self._look(self._steady())
+                self._check(self._steady())
                 del self._renewals[number]
 
     def felt(self) -> bool:
         """Whether a lease that has run out says nothing now."""
         with self._lock:
             now = self._steady()
-            self._look(now)
+            self._check(now)
             return self._noted_at is not None and now - self._noted_at < HOLD
 
     def owed(self) -> bool:
@@ -77,7 +77,7 @@ class Overload:
             owed, self._owed = self._owed, False
             return owed
 
-    def _look(self, now: float) -> None:
+    def _check(self, now: float) -> None:
         late = self._beat_at is not None and now - self._beat_at > LATE
         if late or any(now - began > LATE for began in self._renewals.values()):
             self._note(now)

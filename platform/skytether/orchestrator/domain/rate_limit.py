@@ -24,7 +24,7 @@ class RateLimiter:
     def wait(self, caller: str) -> float:
         """Take one request from a caller's bucket; seconds until there is one if it is empty, else 0."""
         with self._lock:
-            return self._take(caller, self._clock())
+            return self._consume(caller, self._clock())
 
     def empty(self, caller: str) -> float:
         """Seconds until there is one request in a caller's bucket; nothing is taken."""
@@ -42,7 +42,7 @@ class RateLimiter:
         level, at = self._buckets.get(caller, (self._burst, now))
         return min(self._burst, level + max(0.0, now - at) * self._rate)
 
-    def _take(self, caller: str, now: float) -> float:
+    def _consume(self, caller: str, now: float) -> float:
         level = self._level(caller, now)
         allowed = level >= 1.0
         self._keep(caller, level - 1.0 if allowed else level, now)

@@ -181,7 +181,7 @@ class Secrets:
         self._seen = self._signature()
         self._held = self._read()
 
-    def look(self) -> bool:
+    def reload(self) -> bool:
         """Whether a secret is used from now on that was not before; one that is gone is used no more.
 
         Raises:
@@ -243,7 +243,7 @@ class Secrets:
         """
         key = self._key(of)
         if key is None:  # another orchestrator was quicker to see a rotation
-            self.look()
+            self.reload()
             key = self._key(of)
         if key is None:
             raise SecretFileError(f"the secret key {of} that session {session_id} began with is not in {self._folder}")

@@ -54,7 +54,7 @@ class _Budget:
         """Of each list and mapping of the document, by identity: they are looked at again and again."""
         self.steps = self.left = _STEPS + _STEPS_EACH * self._weigh(document)
 
-    def take(self, steps: int) -> None:
+    def spend(self, steps: int) -> None:
         self.left -= steps
         if self.left < 0:
             raise BudgetError(f"take more than {self.steps} steps to check")
@@ -106,7 +106,7 @@ def _counted(keyword: str, check: _Check) -> _Check:
     def counting(validator: Any, value: Any, instance: Any, schema: Any) -> Iterator[ValidationError] | None:
         budget = _budget.get()
         if budget is not None:
-            budget.take(_steps(keyword, value, instance, schema, budget))
+            budget.spend(_steps(keyword, value, instance, schema, budget))
         return check(validator, value, instance, schema)
 
     return counting

@@ -140,7 +140,7 @@ class Groups:
         self._find_provider = find_provider
         self._lock = threading.Lock()
         self._groups: dict[str, SiteGroup] = {}
-        self._looker = Loop("groups", self._look, time.monotonic)
+        self._looker = Loop("groups", self._try_refresh, time.monotonic)
 
     def start(self, step: Callable[[SiteGroup], float], declared: Iterable[GroupCreate] = ()) -> None:
         """Open every group of the store.
@@ -171,7 +171,7 @@ class Groups:
             self._store.change_site_group(asked.name, asked=asked)
             log.info("group %s is changed to what the sites file says", asked.name)
 
-    def _look(self) -> float:
+    def _try_refresh(self) -> float:
         try:
             self.refresh()
         except GONE as error:

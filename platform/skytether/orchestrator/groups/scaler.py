@@ -118,7 +118,7 @@ class Scaler:
         return self._lead.leads and self._lead.epoch == fence()
 
     def _pass(self, group: SiteGroup) -> float:
-        there = self._look(group)
+        there = self._list_machines(group)
         row = self._store.site_group(group.name)
         if there is None or row is None:
             return _REST
@@ -138,7 +138,7 @@ class Scaler:
             self._forget_site(group.name)
         return _BUSY if any(machine.stage is not Stage.READY for machine in rows) else _REST
 
-    def _look(self, group: SiteGroup) -> Sequence[Found] | None:
+    def _list_machines(self, group: SiteGroup) -> Sequence[Found] | None:
         """What is there; None: nobody knows."""
         obstacle = self._ask_offer(group)
         try:
@@ -166,7 +166,7 @@ class Scaler:
         known = {row.name for row in rows}
         for found in there:
             if found.name not in known and found.condition is not Condition.GOING:
-                self._tell(group, f"{found.name} is destroyed: nobody ordered it")
+                self._report(group, f"{found.name} is destroyed: nobody ordered it")
                 self._destroy(group, found)
 
     def _follow(self, group: SiteGroup, row: GroupRow, machine: MachineRow, found: Sequence[Found]) -> None:
@@ -188,7 +188,7 @@ class Scaler:
                 self._follow_joining(group, row, machine, site)
             elif site is None:
                 if machine.stage is Stage.READY:
-                    self._tell(group, f"{machine.name} is given back: it is a site no more")
+                    self._report(group, f"{machine.name} is given back: it is a site no more")
                 why = machine.reason or "it is a site no more"
                 self._store.advance_machine(machine.name, Stage.REMOVING, self._clock(), why)
             elif machine.stage is Stage.DRAINING:
@@ -211,7 +211,7 @@ class Scaler:
         mine = next((one for one in found if one.id == machine.provided), None)
         for other in found:
             if other is not mine and other.condition is not Condition.GOING:
-                self._tell(group, f"{other.name} is there twice: {other.id} is destroyed")
+                self._report(group, f"{other.name} is there twice: {other.id} is destroyed")
                 self._destroy(group, other)
         return mine
 
@@ -230,7 +230,7 @@ class Scaler:
         if machine.stage is Stage.JOINING:
             self._failed(group, f"{machine.name}: {why}")
         else:
-            self._tell(group, f"{machine.name} is lost: {why}")
+            self._report(group, f"{machine.name} is lost: {why}")
         self._store.advance_machine(machine.name, Stage.REMOVING, self._clock(), why)
         if site is None:
             return
@@ -247,7 +247,7 @@ class Scaler:
         site.group = group.name
         if self._store.advance_machine(machine.name, Stage.READY, self._clock()):
             group.proven = site.capacity
-            self._tell(group, f"{machine.name} is a site")
+            self._report(group, f"{machine.name} is a site")
             if row.failures:
                 self._store.change_site_group(group.name, failures=0, retry_at=0.0, reason="")
             self._wake_placer()
@@ -300,7 +300,7 @@ class Scaler:
             gone = self._destroy(group, Found(machine.provided, machine.name, Condition.GOING))
         if gone:
             self._store.forget_machines([machine.name])
-            self._tell(group, f"{machine.name} is destroyed")
+            self._report(group, f"{machine.name} is destroyed")
 
     def _destroy(self, group: SiteGroup, found: Found) -> bool:
         """Whether the provider heard of it."""
@@ -318,16 +318,16 @@ class Scaler:
         if isinstance(step, Make):
             name = f"{group.name}-{secrets.token_hex(3)}"
             if self._store.add_machine(MachineRow(name, group.name, Stage.MAKING, now, reason=step.why)):
-                self._tell(group, f"{name} is made: {step.why}")
+                self._report(group, f"{name} is made: {step.why}")
                 self._order(group, name)
         elif isinstance(step, Drain):
             if self._store.advance_machine(step.machine, Stage.DRAINING, now, step.why):
-                self._tell(group, f"{step.machine} is given back: {step.why}")
+                self._report(group, f"{step.machine} is given back: {step.why}")
                 site = self._sites.find(step.machine)
                 if site is not None:
                     self._empty(site)
         elif self._store.advance_machine(step.machine, Stage.REMOVING, now, step.why):
-            self._tell(group, f"{step.machine} is given back: {step.why}")
+            self._report(group, f"{step.machine} is given back: {step.why}")
             if step.failed:
                 self._failed(group, f"{step.machine}: {step.why}")
 
@@ -351,9 +351,9 @@ class Scaler:
         wait = backoff(failures)
         retry_at = self._clock() + wait
         self._store.change_site_group(group.name, failures=failures, retry_at=retry_at, reason=why)
-        self._tell(group, f"{why}; none is made for {wait:g} s", logging.WARNING)
+        self._report(group, f"{why}; none is made for {wait:g} s", logging.WARNING)
 
-    def _tell(self, group: SiteGroup, text: str, level: int = logging.INFO) -> None:
+    def _report(self, group: SiteGroup, text: str, level: int = logging.INFO) -> None:
         log.log(level, "group %s: %s", group.name, text)
         self._store.tell_site_group(group.name, self._clock(), text)
 

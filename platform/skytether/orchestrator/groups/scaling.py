@@ -111,7 +111,7 @@ class _Room:
     """Empty: it is to be made."""
     taken: bool = False
 
-    def take(self, needs: Needs) -> bool:
+    def reserve(self, needs: Needs) -> bool:
         wanted = (needs.cpu, self.cpu), (needs.memory_mb, self.memory_mb), (needs.gpu, self.gpu)
         if any(need > there + _ROUNDING for need, there in wanted):
             return False
@@ -255,12 +255,12 @@ def _assign(plans: Mapping[str, _Plan], waiting: Iterable[Waiting], now: float) 
             view = plan.view
             if view.draining:
                 continue
-            found = any(room.take(one.needs) for room in plan.rooms)
+            found = any(room.reserve(one.needs) for room in plan.rooms)
             if not found and (plan.full or view.offer is None or now < view.retry_at):
                 continue
             counted_on.add(plan.name)
             if not found and now - one.since >= view.asked.grow_after_s:
-                plan.more(_waits(one)).take(one.needs)
+                plan.more(_waits(one)).reserve(one.needs)
             break
     return counted_on
 

@@ -29,7 +29,7 @@ class LiveCertificate:
         """For connections from now on. Another one after each renewal: OpenSSL keeps a certificate for each kind of key
         in one, so an old one of another kind would be served on."""
 
-    def look(self) -> None:
+    def reload(self) -> None:
         """Use what is in the files, if they changed and go together; otherwise go on with what was there before."""
         now = self._signature()
         if now == self._seen:

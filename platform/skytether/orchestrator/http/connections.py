@@ -345,7 +345,7 @@ class Acceptor:
         self.table = ConnectionTable(limits, most)
         listener.setblocking(False)
         self._open = True
-        self._loop.add_reader(listener.fileno(), self._take)
+        self._loop.add_reader(listener.fileno(), self._accept)
         self._sweeping = self._loop.create_task(self._sweep())
 
     def close(self) -> None:
@@ -366,7 +366,7 @@ class Acceptor:
         if gives_way is not None:
             self._end(gives_way)
 
-    def _take(self) -> None:
+    def _accept(self) -> None:
         for _ in range(_AT_ONCE):
             try:
                 taken, peer = self._listener.accept()
@@ -387,7 +387,7 @@ class Acceptor:
         if not has_room:
             taken.close()
             self._overload.note()
-            self._tell("no room for a connection from %s: all that are open have shown a token", address)
+            self._warn("no room for a connection from %s: all that are open have shown a token", address)
             return
         connection = Connection(address, self._loop.time() + self._limits.head_s, self._know)
         self.table.come(connection)
@@ -427,7 +427,7 @@ class Acceptor:
     def _without_files(self, error: OSError) -> None:
         """Robots that would come in now cannot: a stranger gives way, and the next attempt is a moment later."""
         self._overload.note()
-        self._tell("a connection cannot be taken: %s", error.strerror)
+        self._warn("a connection cannot be taken: %s", error.strerror)
         gives_way = self.table.stranger()
         if gives_way is not None:
             self._end(gives_way)
@@ -436,7 +436,7 @@ class Acceptor:
 
     def _again(self) -> None:
         if self._open:
-            self._loop.add_reader(self._listener.fileno(), self._take)
+            self._loop.add_reader(self._listener.fileno(), self._accept)
 
     async def _sweep(self) -> None:
         while True:
@@ -457,7 +457,7 @@ class Acceptor:
         except ValueError:
             return False
 
-    def _tell(self, text: str, what: object) -> None:
+    def _warn(self, text: str, what: object) -> None:
         """Once a minute at most: whoever attacks must not fill a log too."""
         now = self._loop.time()
         if now - self._told_at >= 60.0:

@@ -33,18 +33,18 @@ class EchoLooks:
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[bool] = loop.create_future()
 
-        def tell(answers: bool) -> None:
+        def resolve(answers: bool) -> None:
             self._under_way -= 1
             if not answered.done():
                 answered.set_result(answers)
 
-        def look() -> None:
+        def probe() -> None:
             answers = echo_answers(*where)
             with contextlib.suppress(RuntimeError):  # all of it has ended meanwhile
-                loop.call_soon_threadsafe(tell, answers)
+                loop.call_soon_threadsafe(resolve, answers)
 
         self._under_way += 1
-        threading.Thread(target=look, name="node-echo", daemon=True).start()
+        threading.Thread(target=probe, name="node-echo", daemon=True).start()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(_PATIENCE_S):
                 return await answered

@@ -189,7 +189,7 @@ class NodeListener:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._accept())
             group.create_task(self._sweep())
-            group.create_task(self._look())
+            group.create_task(self._cut_removed())
 
     async def _accept(self) -> None:
         while True:
@@ -254,7 +254,7 @@ class NodeListener:
                 self._end(connection)
             await asyncio.sleep(0.5)
 
-    async def _look(self) -> None:
+    async def _cut_removed(self) -> None:
         """Cut those off that are no sites any more, by way of whichever orchestrator they were removed."""
         while True:
             linked = self._ways.linked()
@@ -416,7 +416,7 @@ class NodeListener:
             raise TooManyError(wait)
         try:
             if isinstance(request, Look):
-                invitation = await asyncio.to_thread(self._enrolment.look, request.token)
+                invitation = await asyncio.to_thread(self._enrolment.check_token, request.token)
                 site = invitation.site
                 urls = self._enrolment.urls
                 return Invited(name=site.name, tier=site.tier, ends_at=invitation.expires_at, urls=urls)

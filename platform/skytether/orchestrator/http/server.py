@@ -227,7 +227,7 @@ class _Server(uvicorn.Server):
 
     async def on_tick(self, counter: int) -> bool:
         if self._certificate is not None and counter % _CERTIFICATE_TICKS == 0:
-            self._certificate.look()
+            self._certificate.reload()
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

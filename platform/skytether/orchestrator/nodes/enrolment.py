@@ -110,7 +110,7 @@ class Enrolment:
         self._rows.invite(invitation, forgotten_before=now - LONGEST_S)
         return invitation, f"{token}.{self._authority.pin}"
 
-    def look(self, token: str) -> Invitation:
+    def check_token(self, token: str) -> Invitation:
         """What a token is good for.
 
         Raises:
@@ -175,7 +175,7 @@ class Enrolment:
             node = self._rows.get(invitation.site.name)
             if node is not None and node.joined_at == invitation.used_at:
                 return node, self._issue(node, asked.request)
-        invitation = self.look(asked.token)
+        invitation = self.check_token(asked.token)
         name, now = invitation.site.name, self._clock()
         certificate = self._authority.sign(asked.request, name, self._days)
         node = Node(
@@ -197,7 +197,7 @@ class Enrolment:
         try:
             self._sites.add(site, put=put)
         except ConflictError:
-            self.look(asked.token)  # somebody else was quicker with this token, or with this name: it says which
+            self.check_token(asked.token)  # somebody else was quicker with this token, or with this name: it says which
             raise
         log.info("site %s joined from %s, invited by %s", name, seen_as, invitation.by)
         return node, Issued(name=name, certificate=pem_of(certificate), urls=self.urls)

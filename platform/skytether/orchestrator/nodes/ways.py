@@ -69,7 +69,7 @@ class LinkedNode:
     listener: socket.socket | None = None
     tasks: set[asyncio.Task[None]] = field(default_factory=set)
 
-    def tell(self, told: Told) -> None:
+    def send(self, told: Told) -> None:
         """Without waiting: who does not read for long is cut off by its silence."""
         self.writer.write(line_of(told))
 
@@ -102,7 +102,7 @@ class Ways:
         if node is None:
             return False
         before = node.heard_at
-        node.tell(Told(ping=0))
+        node.send(Told(ping=0))
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(PING_S / 2):
                 while self._nodes.get(name) is node and node.heard_at == before:
@@ -130,7 +130,7 @@ class Ways:
                 await _until_free(self._lines, node.name)
                 if said.engine is not None:
                     await _until_free(self._turns, node.name)
-                self._hear(node, said)
+                self._on_message(node, said)
                 if node.writer.transport.get_write_buffer_size() > _MOST_UNREAD:
                     return "it does not read what it is told"
         except asyncio.IncompleteReadError:
@@ -142,10 +142,10 @@ class Ways:
 
     async def _ping(self, node: LinkedNode) -> None:
         for number in range(1, 1 << 62):
-            node.tell(Told(ping=number))
+            node.send(Told(ping=number))
             await asyncio.sleep(PING_S)
 
-    def _hear(self, node: LinkedNode, said: Said) -> None:
+    def _on_message(self, node: LinkedNode, said: Said) -> None:
         if said.engine is not None and said.engine != node.engine_away:
             node.engine_away = said.engine
             if said.engine:
@@ -213,7 +213,7 @@ class Ways:
 
         listener.setblocking(False)
         node.listener = listener
-        asyncio.get_running_loop().add_reader(listener.fileno(), self._take, node, listener)
+        asyncio.get_running_loop().add_reader(listener.fileno(), self._accept, node, listener)
         (folder / ENGINE_AWAY).unlink(missing_ok=True)
         self._want(node, SPARE - len(node.spare) - node.wanted)
 
@@ -227,7 +227,7 @@ class Ways:
             (folder / ENGINE_SOCKET).unlink(missing_ok=True)
             (folder / ENGINE_AWAY).write_text(why)
 
-    def _take(self, node: LinkedNode, listener: socket.socket) -> None:
+    def _accept(self, node: LinkedNode, listener: socket.socket) -> None:
         """Somebody here wants to ask a node's engine. asyncio's own servers lose whom they take as they are closed."""
         try:
             taken, _ = listener.accept()
@@ -246,7 +246,7 @@ class Ways:
         count = min(count, MOST_WAYS - node.open - node.wanted)
         if count > 0:
             node.wanted += count
-            node.tell(Told(open=count))
+            node.send(Told(open=count))
 
     async def bring(self, node: LinkedNode, stream: Stream) -> bool:
         """A node has opened a way: keep it until it is used up. False: nobody asked for it."""

@@ -101,10 +101,10 @@ class OpenstackProvider(Provider):
 
     def offer(self) -> Capacity:
         if time.monotonic() - self._looked_at >= _LOOK_AGAIN:
-            self._look()
+            self._refresh()
         return self._offer
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         options, cloud = self._options, self._cloud
         with self._translated():
             flavor = self._find("flavor", options.flavor, cloud.compute.find_flavor)
@@ -131,7 +131,7 @@ class OpenstackProvider(Provider):
             if found.name == order.name and found.condition is not Condition.GOING:
                 return found.id
         if not self._ids:
-            self._look()
+            self._refresh()
         with self._translated():
             made = self._cloud.compute.create_server(**self._asked(order))
         return str(made.id)

@@ -308,10 +308,10 @@ class ProcessRuntime(Runtime):
 
     def _seen(self, run: Run, *, measure: bool = False, all_run: bool = False) -> Observation | None:
         if not run.ended and (measure or not run.runs_on(all_run)):
-            run.seen = self._look(run)
+            run.seen = self._observe(run)
         return run.seen
 
-    def _look(self, run: Run) -> Observation:
+    def _observe(self, run: Run) -> Observation:
         if run.beginning:
             return Observation(run.attempt, Phase.STARTING)
         stat = run.process and stat_of(run.process)
@@ -416,7 +416,7 @@ class ProcessRuntime(Runtime):
             if own is None or own > _OWN_MB << 20:
                 run.exceeds = f"has more than {_OWN_MB} MiB, {MOST_FILES} files or too deep ones in its own folder"
             if run.exceeds:
-                run.seen = self._look(run)
+                run.seen = self._observe(run)
 
     def tidy(self) -> None:
         self._fence.must_lead()

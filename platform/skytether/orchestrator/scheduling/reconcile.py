@@ -152,7 +152,7 @@ class Reconciler:
             self._note_hosted(site, live)
         due = whole and time.monotonic() - site.tidied_at >= _TIDY
         ids = {record.id for record in live}
-        looked = self._look(site, ids, led, whole=whole, due=due)
+        looked = self._observe(site, ids, led, whole=whole, due=due)
         if looked is None:
             return self._timing.place
         self._keep_seen(site, live, looked, whole=whole)
@@ -195,7 +195,9 @@ class Reconciler:
         before = self._store.robots_at(site.name) if site.hosted is None else site.hosted
         site.hosted = before | {record.robot for record in live}
 
-    def _look(self, site: Site, ids: Set[str], led: int, *, whole: bool, due: bool) -> Mapping[str, Observation] | None:
+    def _observe(
+        self, site: Site, ids: Set[str], led: int, *, whole: bool, due: bool
+    ) -> Mapping[str, Observation] | None:
         """What is at a site: all of it, or these only; None: it does not answer, and is noted as silent.
 
         ``led``: the epoch that it is to be told first; 0: none.

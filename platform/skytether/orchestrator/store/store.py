@@ -161,17 +161,17 @@ class Store(GroupStore):
     def all(self, robot: str | None = None) -> list[Record]:
         """Newest first; of one robot, or of all."""
         if robot is None:
-            return sorted(self._look(sql.EVERY), key=lambda record: -record.created_at)
+            return sorted(self._select(sql.EVERY), key=lambda record: -record.created_at)
         query = select(instances).where(instances.c.robot == robot)
         return self._records(query.order_by(instances.c.created_at.desc(), instances.c.id))
 
     def live(self) -> list[Record]:
         """All that has not ended, oldest first."""
-        return self._look(sql.ALL_LIVE)
+        return self._select(sql.ALL_LIVE)
 
     def live_of(self, robot: str) -> list[Record]:
         """All of one robot that has not ended, oldest first."""
-        return self._look(sql.LIVE_OF, robot=robot)
+        return self._select(sql.LIVE_OF, robot=robot)
 
     def count_live(self, service: str) -> int:
         """How many instances of a service have not ended."""
@@ -180,19 +180,19 @@ class Store(GroupStore):
 
     def live_at(self, site: str, *, changing: bool = False) -> list[Record]:
         """All at one site that has not ended, oldest first; with ``changing`` only what is starting or stopping."""
-        return self._look(sql.CHANGING_AT if changing else sql.LIVE_AT, site=site)
+        return self._select(sql.CHANGING_AT if changing else sql.LIVE_AT, site=site)
 
     def waiting(self) -> list[Record]:
         """All that has no site yet, oldest first."""
-        return self._look(sql.WAITING)
+        return self._select(sql.WAITING)
 
     def live_standbys(self) -> list[Record]:
         """Those that are nobody's and have not ended, oldest first."""
-        return self._look(sql.LIVE_STANDBYS)
+        return self._select(sql.LIVE_STANDBYS)
 
     def standbys(self, service: str) -> list[Record]:
         """Those of a service that run and are nobody's, oldest first."""
-        return self._look(sql.STANDBYS, service=service)
+        return self._select(sql.STANDBYS, service=service)
 
     def robots_at(self, site: str) -> frozenset[str]:
         """Robots of all instances at a site of which the store has a row, ended or not."""
@@ -452,7 +452,7 @@ class Store(GroupStore):
             connection.execute(delete(events).where(events.c.id <= (beyond or 0)))
         return gone
 
-    def _look(self, versions: Select[str, int], **named: str) -> list[Record]:
+    def _select(self, versions: Select[str, int], **named: str) -> list[Record]:
         """Oldest first. Of those that have not changed since they were seen last, only the version is read."""
         with self._reader.connect() as connection:
             rows = connection.execute(versions, named).all()

@@ -147,7 +147,7 @@ class Audit:
         fields = {"who": who, "address": address, "method": scope["method"], "path": path, "status": status}
         few = self._strangers if who == NOBODY else self._refused if status >= _FAILED else None
         if few is not None:
-            left_out = few.take(who)
+            left_out = few.admit(who)
             if left_out is None:
                 return
             if left_out:
@@ -167,7 +167,7 @@ class _Few:
         self._throttle = RateLimiter(per_s, at_once, clock)
         self._left_out: Counter[str] = Counter()
 
-    def take(self, who: str) -> int | None:
+    def admit(self, who: str) -> int | None:
         """How many were left out since the last that was written; None: this one is, too."""
         if self._throttle.wait(who):
             self._left_out[who] += 1

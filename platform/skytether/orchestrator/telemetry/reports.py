@@ -66,7 +66,7 @@ class Reports:
                 heard, self._heard = self._heard, {}
             try:
                 while heard:
-                    self._hear(dict(islice(heard.items(), _TOGETHER)))
+                    self._save(dict(islice(heard.items(), _TOGETHER)))
                     for instance in list(islice(heard, _TOGETHER)):
                         del heard[instance]
             finally:
@@ -76,7 +76,7 @@ class Reports:
                         if newer is not one:
                             newer.counted[:0] = one.counted
 
-    def _hear(self, heard: Mapping[str, _Heard]) -> None:
+    def _save(self, heard: Mapping[str, _Heard]) -> None:
         counted: dict[Owner, list[tuple[str, Counts]]] = {}
         for one in heard.values():
             counted.setdefault(one.owner, []).extend(one.counted)

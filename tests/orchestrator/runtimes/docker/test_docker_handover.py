@@ -73,7 +73,7 @@ class Scene:
     def of(self, _instance: str) -> list[ContainerState]:
         return []
 
-    def look(self, container: str) -> ContainerState:
+    def inspect(self, container: str) -> ContainerState:
         return ContainerState(container, "i1", 1, "running")
 
     def forget(self, _container: str) -> None:
@@ -323,16 +323,16 @@ def test_a_look_that_comes_late_does_not_hide_what_a_later_one_has_seen(busy: Bu
     engine: Any = busy
     follower = Follower(engine, "me", lambda: None, 5.0)
     busy.there["c1"] = "created"
-    late = threading.Thread(target=follower.look, args=("c1",), name="late")
+    late = threading.Thread(target=follower.inspect, args=("c1",), name="late")
     late.start()
     assert busy.looks.wait(PATIENCE)
     busy.there["c1"] = "exited"
-    follower.look("c1")
+    follower.inspect("c1")
     if gone:
         follower.forget("c1")
     busy.go_on.set()
     late.join(PATIENCE)
     assert [seen.status for seen in follower.of("c1")] == ([] if gone else ["exited"])
-    follower.look("c1")
+    follower.inspect("c1")
     assert [seen.status for seen in follower.of("c1")] == ["exited"], "as another list shows it"
     follower.close()

@@ -76,24 +76,24 @@ def reader(engine: Any) -> ReportReader:
 def test_a_file_is_read_when_it_changed_only(engine: MadeUpEngine) -> None:
     engine.files["c1"] = json.dumps(ONE).encode()
     read = reader(engine)
-    read.look()
-    read.look()
+    read.refresh()
+    read.refresh()
     assert (read.of("c1"), read.of("c2"), engine.gets) == ((ServiceReport(1, "lost", "here"),), (), 1)
     engine.files["c1"] = json.dumps(ONE).replace("here", "there").encode()
-    read.look()
+    read.refresh()
     assert [report.message for report in read.of("c1")] == ["there"]
     del engine.files["c1"]
-    read.look()
+    read.refresh()
     assert read.of("c1") == ()
 
 
 def test_a_file_that_changes_while_it_is_fetched_keeps_no_other_from_being_read(engine: MadeUpEngine) -> None:
     engine.files["c1"] = engine.files["c2"] = json.dumps(ONE).encode()
     read = reader(engine)
-    read.look()
+    read.refresh()
     engine.files = {"c1": b"{}", "c2": json.dumps(ONE).replace("here", "there").encode()}
     engine.shifting = {"c1"}
-    read.look()
+    read.refresh()
     assert [report.message for report in read.of("c2")] == ["there"]
     assert [report.message for report in read.of("c1")] == ["here"], "what was read of it before stays"
 
@@ -102,14 +102,14 @@ def test_a_file_that_changes_while_it_is_fetched_keeps_no_other_from_being_read(
 def test_what_is_no_plain_file_is_not_fetched(engine: MadeUpEngine, mode: int) -> None:
     engine.files["c1"], engine.mode = json.dumps(ONE).encode(), mode
     read = reader(engine)
-    read.look()
+    read.refresh()
     assert (read.of("c1"), engine.gets) == ((), 0)
 
 
 def test_what_is_too_large_is_not_fetched(engine: MadeUpEngine) -> None:
     engine.files["c1"] = b" " * MOST_BYTES + json.dumps(ONE).encode()
     read = reader(engine)
-    read.look()
+    read.refresh()
     assert (read.of("c1"), engine.gets) == ((), 0)
 
 

@@ -466,7 +466,7 @@ def test_who_is_asked_too_slowly_is_not_ill(docker_site: DockerSite, runtime: Do
         until_phase(runtime, Phase.RUNNING)
         (container,) = docker_site.containers()
         until(lambda: docker("inspect", "-f", "{{.State.Health.Status}}", container) == "unhealthy")
-        runtime.follower.look(container)
+        runtime.follower.inspect(container)
         assert runtime.observe()["i1"].detail == ""
         runtime.remove("i1")
 

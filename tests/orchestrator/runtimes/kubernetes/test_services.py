@@ -106,7 +106,7 @@ def test_where_a_load_balancer_passes_on(ingress: Any, told: Any) -> None:
 def test_an_instance_waits_for_its_address_with_a_reason_and_not_for_ever() -> None:
     scene = Scene(load_balancer_timeout_s=60)
     assert scene.services.make("i1") is None
-    assert scene.services.look({"i1"}, {"i1"}) == []
+    assert scene.services.reconcile({"i1"}, {"i1"}) == []
     scene.now += 25
     why = scene.services.balancer("i1")
     assert why == (
@@ -114,9 +114,9 @@ def test_an_instance_waits_for_its_address_with_a_reason_and_not_for_ever() -> N
         "'kubectl -n skytether describe service skytether-o1-i1' says why"
     )
     scene.now += 36
-    assert scene.services.look({"i1"}, {"i1"}) == ["i1"]
+    assert scene.services.reconcile({"i1"}, {"i1"}) == ["i1"]
     scene.cluster.give("i1", ip="203.0.113.9")
-    assert scene.services.look({"i1"}, {"i1"}) == []
+    assert scene.services.reconcile({"i1"}, {"i1"}) == []
     assert scene.services.balancer("i1") == ("203.0.113.9", 7600)
 
 
@@ -125,29 +125,29 @@ def test_services_are_listed_while_one_waits_and_else_once_a_minute() -> None:
     scene.services.make("i1")
     scene.cluster.give("i1", ip="203.0.113.9")
     for _ in range(3):
-        scene.services.look({"i1"}, {"i1"})
+        scene.services.reconcile({"i1"}, {"i1"})
     assert scene.cluster.listed == 1
     scene.services.make("i2")
     for _ in range(3):
-        scene.services.look({"i1", "i2"}, {"i1", "i2"})
+        scene.services.reconcile({"i1", "i2"}, {"i1", "i2"})
     assert scene.cluster.listed == 4
     scene.cluster.give("i2", ip="203.0.113.10")
-    scene.services.look({"i1", "i2"}, {"i1", "i2"})
+    scene.services.reconcile({"i1", "i2"}, {"i1", "i2"})
     scene.now += 59
-    scene.services.look({"i1", "i2"}, {"i1", "i2"})
+    scene.services.reconcile({"i1", "i2"}, {"i1", "i2"})
     assert scene.cluster.listed == 5
 
 
 def test_one_that_somebody_removed_is_made_again_and_one_of_nobody_goes() -> None:
     scene = Scene()
     scene.services.make("gone")
-    scene.services.look({"i1"}, {"i1"})
+    scene.services.reconcile({"i1"}, {"i1"})
     assert list(scene.cluster.there) == ["services/skytether-o1-i1"]
     scene.services.make("gone")
     scene.leads = False
     scene.now += 61
     with pytest.raises(OvertakenError):
-        scene.services.look({"i1"}, {"i1"})
+        scene.services.reconcile({"i1"}, {"i1"})
 
 
 def test_one_of_an_instance_that_has_ended_goes_though_its_pods_stay_for_their_logs() -> None:
@@ -155,12 +155,12 @@ def test_one_of_an_instance_that_has_ended_goes_though_its_pods_stay_for_their_l
     for instance in ("ended", "crashed"):
         scene.services.make(instance)
     scene.now += 60
-    scene.services.look({"ended", "crashed"}, set(), idle={"ended", "crashed"})
+    scene.services.reconcile({"ended", "crashed"}, set(), idle={"ended", "crashed"})
     assert len(scene.cluster.there) == 2  # the next run of one that has crashed is reached as the one before
     scene.now += 30
-    scene.services.look({"ended", "crashed"}, {"crashed"}, idle={"ended"})
+    scene.services.reconcile({"ended", "crashed"}, {"crashed"}, idle={"ended"})
     scene.now += 30
-    scene.services.look({"ended", "crashed"}, {"crashed"}, idle={"ended"})
+    scene.services.reconcile({"ended", "crashed"}, {"crashed"}, idle={"ended"})
     assert list(scene.cluster.there) == ["services/skytether-o1-crashed"]
 
 
@@ -176,6 +176,6 @@ def test_a_site_that_needs_no_services_asks_for_none() -> None:
     scene = Scene(reach="pod")
     assert scene.services.make("i1") is None
     assert scene.services.balancer("i1") is None
-    scene.services.look({"i1"}, {"i1"})
+    scene.services.reconcile({"i1"}, {"i1"})
     scene.services.clear()
     assert (scene.cluster.there, scene.cluster.listed) == ({}, 0)

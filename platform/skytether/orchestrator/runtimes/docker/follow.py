@@ -178,13 +178,13 @@ class Follower:
         try:
             with self._engine.asked():
                 before, rows = self._list(self._engine.api())
-            self._take(before, rows, anew=False)
+            self._apply_list(before, rows, anew=False)
         except RuntimeFailure:
             raise
         except Exception as error:  # as in the thread: an engine may be anybody's
             raise _not_understood(error) from error
 
-    def look(self, container: str) -> ContainerState | None:
+    def inspect(self, container: str) -> ContainerState | None:
         """Look at one container now; None: it is not there, or not ours.
 
         Raises:
@@ -263,7 +263,7 @@ class Follower:
             since = int(datetime.fromisoformat(_seconds(self._info["SystemTime"])).timestamp())
             quiet = self._engine.api(self._quiet_s)
             before, rows = self._list(api)
-        self._take(before, rows, anew=not self._connected)
+        self._apply_list(before, rows, anew=not self._connected)
         self._failure = None
         self.looked.set()
         if not self._connected:
@@ -288,14 +288,14 @@ class Follower:
             raise RuntimeFailure(f"the engine lists {len(rows)} containers of this site: that cannot be")
         return before, rows
 
-    def _take(self, before: set[str], rows: Sequence[Mapping[str, Any]], *, anew: bool) -> None:
+    def _apply_list(self, before: set[str], rows: Sequence[Mapping[str, Any]], *, anew: bool) -> None:
         """Look at what has changed by a list, or at all of it ``anew``."""
         # What holds a network comes before who is in there, whose network would seem to be gone.
         there = [row["Id"] for row in sorted(rows, key=lambda row: INSTANCE in (row["Labels"] or ()))]
         for container in before - set(there):  # and not what a start has made and looked at since
             self.forget(container)
         for container in there if anew else self._changed(rows, there):
-            seen = self.look(container)
+            seen = self.inspect(container)
             if anew and seen is not None and seen.runs and not seen.ready:
                 self._look_ready(container)  # or an adopted one would seem to start
 
@@ -321,7 +321,7 @@ class Follower:
                 if action == "destroy":
                     self.forget(container)
                 elif action in _TOLD:
-                    self.look(container)
+                    self.inspect(container)
                 elif action.startswith(_AT_WILL):
                     self._look_now_and_then(container)
 
@@ -335,7 +335,7 @@ class Follower:
         again = threading.Timer(_AT_WILL_S, self._look_again, (container,))
         again.daemon = True
         again.start()
-        self.look(container)
+        self.inspect(container)
 
     def _look_again(self, container: str) -> None:
         with self._lock:

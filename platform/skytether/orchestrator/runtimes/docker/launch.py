@@ -189,7 +189,7 @@ class Job:
             self._must_lead()  # whoever asked for its end may have been followed: it is the later leader's then
             with suppress(RuntimeFailure):
                 kill(self._engine, made.id, "KILL")
-            self._follower.look(made.id)
+            self._follower.inspect(made.id)
 
     def _clear(self) -> bool:
         """End what is left of earlier runs; of most, forget it too. Whether this very run was begun meanwhile."""
@@ -220,7 +220,7 @@ class Job:
 
     def _wait_for_end(self, seen: ContainerState) -> None:
         deadline = time.monotonic() + _END_S
-        while (now := self._follower.look(seen.id)) is not None and now.runs:
+        while (now := self._follower.inspect(seen.id)) is not None and now.runs:
             if time.monotonic() > deadline:
                 raise RuntimeFailure("what is left of the run before cannot be ended: see the engine's log")
             time.sleep(0.02)
@@ -261,7 +261,7 @@ class Job:
             raise RuntimeFailure(f"there is a container {name} that is not of this site: remove it")
         self._must_lead()
         if self._is_this(seen):
-            return self._follower.look(seen.id)
+            return self._follower.inspect(seen.id)
         remove(self._engine, self._follower, seen.id)
         return None
 
@@ -346,10 +346,10 @@ class Job:
                 self._must_lead()  # now that it is there for a later leader to see
                 begun = True  # or will be, whatever comes of the call
                 api.start(made)
-                seen = self._follower.look(made)
+                seen = self._follower.inspect(made)
                 if guard is not None:
                     self._connect(guard, made, openings)
-                    seen = self._follower.look(made)
+                    seen = self._follower.inspect(made)
             except BaseException as error:
                 self._give_up(made, begun=begun)
                 remove(self._engine, self._follower, made)
@@ -379,7 +379,7 @@ class Job:
             close_off(self._engine, self._options, self._owner, guard, made, openings)
             self._engine.api().connect_container_to_network(made, self._options.network)
         except (APIError, RuntimeFailure):
-            seen = self._follower.look(made)
+            seen = self._follower.inspect(made)
             if seen is None or not seen.ended:
                 raise
 

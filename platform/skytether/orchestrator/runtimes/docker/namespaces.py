@@ -163,7 +163,7 @@ class Namespaces:
             try:
                 api.disconnect_container_from_network(made, self._options.network)
                 api.start(made)
-                self._follower.look(made)
+                self._follower.inspect(made)
                 close_off(self._engine, self._options, self._owner, image, made, {})
                 api.connect_container_to_network(made, self._options.network)
                 port = published_port(api.inspect_container(made))

@@ -64,11 +64,11 @@ class ReportReader:
 
     def _look_quietly(self) -> None:
         try:
-            self.look()
+            self.refresh()
         except RuntimeFailure as error:
             log.debug("reports of services are not read: %s", error)
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Look at all of them now.
 
         Raises:

@@ -268,7 +268,7 @@ class DockerRuntime(Runtime):
         with self._doubting(), self.engine.asked():
             api: Any = self.engine.api()  # a `Client`
             api.change(seen.id, wanted.document())
-            after = self.follower.look(seen.id)
+            after = self.follower.inspect(seen.id)
         return after is not None and after.limits == wanted
 
     @override

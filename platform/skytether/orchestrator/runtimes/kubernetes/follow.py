@@ -62,16 +62,16 @@ class Follower(ABC):
         """List and follow until it is closed."""
 
     @abstractmethod
-    def _take(self, document: Document, *, gone: bool) -> None:
+    def _on_event(self, document: Document, *, gone: bool) -> None:
         """One of them has changed."""
 
-    def _read(self, take: Callable[[Document], None]) -> str:
+    def _read(self, add: Callable[[Document], None]) -> str:
         """Read all of them, page by page; the version of the list."""
         query: dict[str, str | int] = {**self._query, "limit": _PAGE}
         while True:
             said = self._cluster.get(self._path, **query)
             for document in said["items"]:
-                take(document)
+                add(document)
             meta = said["metadata"]
             if not meta.get("continue"):
                 return str(meta["resourceVersion"])
@@ -107,7 +107,7 @@ class Follower(ABC):
                         return ""
                     version = str(document.get("metadata", {}).get("resourceVersion", version))
                     if kind in ("ADDED", "MODIFIED", "DELETED"):
-                        self._take(document, gone=kind == "DELETED")
+                        self._on_event(document, gone=kind == "DELETED")
             finally:
                 self._answer = None
         return version

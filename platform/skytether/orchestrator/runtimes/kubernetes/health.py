@@ -43,7 +43,7 @@ class Health:
         """``told`` is called when something else is known than before."""
         self._cluster = cluster
         self._told = told
-        self._now_and_then = NowAndThen("kubernetes-health", _EVERY_S, clock, self._look)
+        self._now_and_then = NowAndThen("kubernetes-health", _EVERY_S, clock, self._check)
         self._pace = Pace(_PER_S, 1)
         self._lock = threading.Lock()
         self._doubted: dict[str, PodState] = {}
@@ -78,7 +78,7 @@ class Health:
     def close(self) -> None:
         self._closing = True
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         with self._lock:
             doubted = [seen for uid, seen in self._doubted.items() if not self._troubles.get(uid)]
         try:

@@ -147,16 +147,16 @@ class Nodes(Follower):
     def _list(self) -> str:
         found: dict[str, Document] = {}
 
-        def take(node: Document) -> None:
+        def add(node: Document) -> None:
             found[node["metadata"]["name"]] = _slim(node)
 
-        version = self._read(take)
+        version = self._read(add)
         self._nodes, self._failure = found, None
         self._looked.set()
         return version
 
     @override
-    def _take(self, document: Document, *, gone: bool) -> None:
+    def _on_event(self, document: Document, *, gone: bool) -> None:
         name = document["metadata"]["name"]
         if gone:
             self._nodes = {n: one for n, one in self._nodes.items() if n != name}

@@ -43,7 +43,7 @@ class ReportReader:
         """``running`` tells the pods to look at; it may raise what the cluster's failure is."""
         self._cluster = cluster
         self._running = running
-        self._now_and_then = NowAndThen("kubernetes-reports", _EVERY_S, clock, self._look)
+        self._now_and_then = NowAndThen("kubernetes-reports", _EVERY_S, clock, self._refresh)
         self._closing = False
         self._rest_until: dict[str, float] = {}
         """By pod, by the monotonic clock [s]."""
@@ -69,7 +69,7 @@ class ReportReader:
     def close(self) -> None:
         self._closing = True
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         rest_until: dict[str, float] = {}
         try:
             for pod in self._running():

@@ -175,7 +175,7 @@ class KubernetesRuntime(Runtime):
         self._must_lead()  # a change by an earlier leader that comes late is seen, and made good
         path = self.cluster.path("pods", f"{seen.name}/resize")
         with self._doubting():
-            self._watch.take(self.cluster.merge_lists(path, patch(seen.uid, wanted)))
+            self._watch.update(self.cluster.merge_lists(path, patch(seen.uid, wanted)))
         return False  # until its node says so
 
     @override
@@ -252,7 +252,7 @@ class KubernetesRuntime(Runtime):
             raise
         self._begun.add(made["metadata"]["uid"])
         self._waiting[made["metadata"]["uid"]] = launch
-        self._watch.take(made)
+        self._watch.update(made)
 
     def _port(self, instance: str, preferred: int | None) -> int:
         ports = self.options.ports
@@ -360,7 +360,7 @@ class KubernetesRuntime(Runtime):
 
     def _end(self, seen: PodState, failure: str = "") -> None:
         if (pod := end_pod(self.cluster, seen.name, seen.uid, failure)) is not None:
-            self._watch.take(pod)
+            self._watch.update(pod)
 
     def _delete(self, seen: PodState) -> None:
         remove_pod(self.cluster, seen.name, seen.uid, grace_s=1 if seen.node else 0)
@@ -433,7 +433,7 @@ class KubernetesRuntime(Runtime):
         up = [seen for seen in there if seen.running and seen.started and not seen.stops and not self._over(seen)]
         ready = {seen.instance: seen for seen in up}
         all_, live = {seen.instance for seen in there}, {seen.instance for seen in there if not self._over(seen)}
-        for instance in self._services.look(all_, ready, all_ - live):
+        for instance in self._services.reconcile(all_, ready, all_ - live):
             self._must_lead()
             self._delete(ready[instance])
             within = f"{self.options.load_balancer_timeout_s:g} s"

@@ -74,7 +74,7 @@ class Services:
             f"'kubectl -n {self._cluster.namespace} describe service {service_name(self._owner, instance)}' says why"
         )
 
-    def look(self, there: Collection[str], ready: Collection[str], idle: Collection[str] = ()) -> list[str]:
+    def reconcile(self, there: Collection[str], ready: Collection[str], idle: Collection[str] = ()) -> list[str]:
         """See which addresses were given, remove what is left of others, and make again what somebody has removed.
 
         Args:

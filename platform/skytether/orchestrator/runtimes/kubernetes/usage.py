@@ -97,7 +97,7 @@ class Meter:
         self._clock = clock
         self._wall = wall
         self._not_before = 0.0
-        self._now_and_then = NowAndThen("kubernetes-metrics", _EVERY_S, clock, self._look)
+        self._now_and_then = NowAndThen("kubernetes-metrics", _EVERY_S, clock, self._refresh)
         self._known: Mapping[str, tuple[Sample, float]] = {}
         """By pod: the newest sample, and processor seconds until then."""
         self._last: dict[str, Usage] = {}
@@ -122,7 +122,7 @@ class Meter:
         if self._clock() >= self._not_before:
             self._now_and_then.begin()
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         try:
             samples = pull_samples(self._cluster.get(self._path, **self._query))
         except RefusedError as error:

@@ -109,7 +109,7 @@ class Watch(Follower):
             self._gone[seen.uid] = seen.name
         self.changed.set()
 
-    def take(self, document: Mapping[str, Any], *, gone: bool = False) -> None:
+    def update(self, document: Mapping[str, Any], *, gone: bool = False) -> None:
         """A pod as an answer, or an event, describes it."""
         seen = parse(document)
         if seen is None:
@@ -150,12 +150,12 @@ class Watch(Follower):
         """The version of the list."""
         found: dict[str, PodState] = {}
 
-        def take(document: Document) -> None:
+        def add(document: Document) -> None:
             seen = parse(document)
             if seen is not None:
                 found[seen.name] = seen
 
-        version = self._read(take)
+        version = self._read(add)
         with self._lock:
             # What an answer has told meanwhile may be newer than the list.
             for name, seen in found.items():
@@ -176,8 +176,8 @@ class Watch(Follower):
         return version
 
     @override
-    def _take(self, document: Document, *, gone: bool) -> None:
-        self.take(document, gone=gone)
+    def _on_event(self, document: Document, *, gone: bool) -> None:
+        self.update(document, gone=gone)
 
 
 def _is_newer(seen: PodState, before: PodState) -> bool:
