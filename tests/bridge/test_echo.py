@@ -56,7 +56,7 @@ def test_nobody_there_is_no_answer():
 
 def said(allowance, size, host, now):
     """Bytes that an address gets for one question."""
-    return size if allowance.take(answer(question(size), (host, 4242)), now) else 0
+    return size if allowance.admit(answer(question(size), (host, 4242)), now) else 0
 
 
 @pytest.mark.parametrize("hosts", [["10.1.2.3"], [f"2001:db8::{i:x}" for i in range(1, 100)]])

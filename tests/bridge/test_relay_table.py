@@ -195,7 +195,7 @@ def test_further_sessions_than_there_is_room_for_disturb_none():
 
 def test_a_bucket_passes_its_rate_and_one_burst():
     bucket = Bucket(rate=1000, capacity=500, now=0.0)
-    passed = sum(100 for i in range(1000) if bucket.take(100, i * 0.01))
+    passed = sum(100 for i in range(1000) if bucket.consume(100, i * 0.01))
     assert 10_400 <= passed <= 10_600  # 9.99 s of 1000 B/s and 500 B; the last may overdraw
 
 

@@ -190,7 +190,7 @@ class DatagramSocket:
             Data (valid until the next call), sender, and the size of each datagram if there are several;
             None if there is nothing more.
         """
-        first, self._next = self._next or self._take(0), None
+        first, self._next = self._next or self._receive_one(0), None
         self.drained = first is None
         if first is None:
             return None
@@ -199,7 +199,7 @@ class DatagramSocket:
         end = start + size
         if ahead and segment is None and size:
             while end <= MAX_DATAGRAM and end - start < MAX_SEGMENTS * size:
-                more = self._take(end)
+                more = self._receive_one(end)
                 if more is None:
                     self.drained = True
                     break
@@ -210,7 +210,7 @@ class DatagramSocket:
             segment = size
         return self._buffer[start:end], address, segment if segment is not None and segment < end - start else None
 
-    def _take(self, start: int) -> _Taken | None:
+    def _receive_one(self, start: int) -> _Taken | None:
         """Have the kernel write into the buffer from there on; None if it has nothing."""
         while True:
             try:

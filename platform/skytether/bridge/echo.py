@@ -97,7 +97,7 @@ class Allowance:
         self._all = Bucket(RATE, RATE, now)
         self._addresses: OrderedDict[bytes, Bucket] = OrderedDict()
 
-    def take(self, said: bytes, now: float) -> bool:
+    def admit(self, said: bytes, now: float) -> bool:
         """Whether that may be said to the address that it names."""
         address = said[16:32]
         key = address if address.startswith(_IPV4) else address[:8]
@@ -105,7 +105,7 @@ class Allowance:
         self._addresses[key] = bucket
         if len(self._addresses) > ADDRESSES:
             self._addresses.popitem(last=False)
-        return bucket.take(len(said), now) and self._all.take(len(said), now)
+        return bucket.consume(len(said), now) and self._all.consume(len(said), now)
 
 
 class EchoServer:
@@ -145,7 +145,7 @@ class EchoServer:
             if said is None:
                 continue
             allowance = known if was_answered(question, said) else strangers
-            if allowance.take(said, time.monotonic()):
+            if allowance.admit(said, time.monotonic()):
                 with contextlib.suppress(OSError):  # larger than the way back takes: silence says so
                     self._socket.sendto(said, source)
             else:

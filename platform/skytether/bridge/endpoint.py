@@ -154,7 +154,7 @@ class Bridge:
             self._driver = Driver(session, self._socket, self._port, self._calls, self._loop)
             self._paths = LocalPaths(self._driver)
             self._names = PeerNames(self._socket.resolve)
-            networks = self._names.known(self._look() if self._wanted else {})
+            networks = self._names.known(self._local_paths() if self._wanted else {})
             # Before the port is told: what it publishes from then on waits for the thread, and is not refused.
             self._thread = threading.Thread(target=self._run, name=f"bridge-{self.address[1]}", daemon=True)
             undo.callback(setattr, self, "_thread", None)
@@ -164,7 +164,7 @@ class Bridge:
         self._loop.call_soon(self._paths.use, networks)
         self._thread.start()
         if self._wanted:
-            self._watcher = Watcher(self._look, self._networks_changed, networks)
+            self._watcher = Watcher(self._local_paths, self._networks_changed, networks)
 
     def publish(self, topic: str, payload: bytes | memoryview) -> bool:
         if topic not in self._sends:
@@ -340,7 +340,7 @@ class Bridge:
         self._last_stats = self._driver.stats()
         self._loop.stop()
 
-    def _look(self) -> dict[Network, LocalPath]:
+    def _local_paths(self) -> dict[Network, LocalPath]:
         return select(self._wanted, addresses(self._socket.family))
 
     # --- helpers ---------------------------------------------------------------------------------------------------

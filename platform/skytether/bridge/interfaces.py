@@ -114,7 +114,7 @@ class Watcher:
     """Tells what came and went, from a thread of its own, until closed.
 
     Args:
-        look: Asks the system.
+        list_networks: Asks the system.
         changed: Called with all networks to use, whenever they are others than before; gives those that are now used.
             It may wait for a name server.
         known: Those that are used already.
@@ -122,12 +122,12 @@ class Watcher:
 
     def __init__(
         self,
-        look: Callable[[], dict[Network, LocalPath]],
+        list_networks: Callable[[], dict[Network, LocalPath]],
         changed: Callable[[dict[Network, LocalPath]], Mapping[Network, object]],
         known: Iterable[Network],
     ) -> None:
         """Start."""
-        self._look = look
+        self._list_networks = list_networks
         self._changed = changed
         self._known = set(known)
         self._closing = threading.Event()
@@ -141,6 +141,6 @@ class Watcher:
 
     def _run(self) -> None:
         while not self._closing.wait(POLL_INTERVAL):
-            found = self._look()
+            found = self._list_networks()
             if found.keys() != self._known:
                 self._known = set(self._changed(found))

@@ -102,7 +102,7 @@ class Bucket:
         self._capacity = self._tokens = capacity
         self._updated = now
 
-    def take(self, amount: float, now: float) -> bool:
+    def consume(self, amount: float, now: float) -> bool:
         """Take ``amount``, if there is anything left."""
         if now > self._updated:
             self._tokens = min(self._capacity, self._tokens + (now - self._updated) * self._rate)
@@ -269,7 +269,7 @@ class RelayTable:
         if flow is None:
             self.rejected["newcomers"] += packets
             return None
-        if not flow.up.take(len(data), now):
+        if not flow.up.consume(len(data), now):
             flow.dropped += packets
             self.rejected["rate"] += packets
             return None
@@ -304,7 +304,7 @@ class RelayTable:
         if flow is leg.route.flow and leg.bytes_down + len(data) > AMPLIFICATION * leg.bytes_up:
             self.rejected["amplification"] += packets
             return False
-        if not flow.down.take(len(data), now):
+        if not flow.down.consume(len(data), now):
             flow.dropped += packets
             self.rejected["rate"] += packets
             return False
@@ -387,9 +387,9 @@ class RelayTable:
         have sent it: no flood of made-up HELLOs holds up a robot that moves.
         """
         session = None if known is None else self.sessions.get(known)
-        if session is not None and session.moves.take(1, now):
+        if session is not None and session.moves.consume(1, now):
             return session
-        return route.flow if route.openings.take(1, now) else None
+        return route.flow if route.openings.consume(1, now) else None
 
     def _open(self, session_id: int, source: Address, route: Route) -> Leg:
         if len(route.newcomers) >= self._limits.newcomers:

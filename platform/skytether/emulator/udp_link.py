@@ -124,7 +124,7 @@ class LinkEmulator:
                 if sock is self._wake_out:
                     self._obey()
                 else:
-                    self._take(sock)
+                    self._receive(sock)
             self._forward(time.monotonic())
 
     def _obey(self) -> None:
@@ -136,7 +136,7 @@ class LinkEmulator:
             self._clients.clear()
             self._backs.clear()
 
-    def _take(self, sock: socket.socket) -> None:
+    def _receive(self, sock: socket.socket) -> None:
         """Take what has arrived at one socket and decide its way."""
         if sock.fileno() < 0:  # closed by a rebind in this turn
             return

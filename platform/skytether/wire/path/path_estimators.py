@@ -271,7 +271,7 @@ class DelayMeter:
         self.pending = 0
         self._evidence *= math.exp(-elapsed / self.MEMORY) if elapsed > 0 else 1.0
         if self._times:
-            self._take(now)
+            self._evaluate_arrivals(now)
         if elapsed > 0:
             self.rate += (1 - math.exp(-elapsed / self.RATE_TIME)) * (self._bytes * 8 / elapsed - self.rate)
             self._bytes = 0
@@ -282,7 +282,7 @@ class DelayMeter:
         else:
             self.capacity = float(self.RATES[np.flatnonzero(self._evidence[:-1] <= self.POSSIBLE)[-1]]) * 8
 
-    def _take(self, now: float) -> None:
+    def _evaluate_arrivals(self, now: float) -> None:
         numbers = np.frombuffer(self._numbers, np.uint32)
         times = np.frombuffer(self._times, np.uint16).astype(np.float64)
         sizes = np.frombuffer(self._sizes, np.uint16).astype(np.float64)
