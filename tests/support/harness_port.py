@@ -27,14 +27,14 @@ class HarnessPort:
         self._calls = [name for name in harness.service.answers if "/_action/" in name]
 
     def attach(self, publisher: Any) -> None:
-        heard = self._harness.take
+        heard = self._harness.receive
 
-        def take(topic: str, payload: bytes | memoryview) -> None:
+        def receive(topic: str, payload: bytes | memoryview) -> None:
             heard(topic, payload)
             if topic in self._carried:
                 publisher.publish(topic, payload)
 
-        self._harness.take = take  # type: ignore[method-assign]
+        self._harness.receive = receive  # type: ignore[method-assign]
         for name in self._calls:
             publisher.answer(name, partial(self._answer, name))
 

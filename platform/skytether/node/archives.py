@@ -85,12 +85,12 @@ class Images:
         """
         wanted = sorted(paths)
         if new := [path for path in wanted if (image, path) not in self._known]:
-            found = self._look(image, new)
+            found = self._inspect(image, new)
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
             return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
         return next((path for path in wanted if self._known[image, path]), None)
 
-    def _look(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
+    def _inspect(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
         body = {
             "Image": image,
             "Entrypoint": ["/never-started"],

@@ -106,11 +106,11 @@ class EngineGate:
             gone = status == HTTPStatus.NOT_FOUND
             text = str(error) if gone else f"this machine's node refuses it: {error}"
             if not gone:
-                self._tell(printable(str(error), lines=False))
+                self._warn_once(printable(str(error), lines=False))
             with contextlib.suppress(OSError):
                 await _answer(back, status, json.dumps({"message": text}).encode(), f"{_JSON}\r\nConnection: close")
 
-    def _tell(self, text: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Each once, and a few of them."""
         if time.monotonic() - self._told_at >= _TOLD_S:
             self._told, self._told_at = set(), time.monotonic()

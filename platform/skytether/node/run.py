@@ -137,18 +137,18 @@ class NodeProgram:
             began = time.monotonic()
             try:
                 await self._link(url)
-                self._say(url, f"the link to {url} ended")
+                self._warn_once(url, f"the link to {url} ended")
                 pause = _AGAIN_S
             except RefusedError as error:
-                self._say(url, f"{url}: {error}")
+                self._warn_once(url, f"{url}: {error}")
                 pause = _REFUSED_S if error.final else wait
             except NodeError as error:
-                self._say(url, str(error))
+                self._warn_once(url, str(error))
                 pause = wait
             wait = _AGAIN_S if time.monotonic() - began > _AGAIN_MOST_S else min(_AGAIN_MOST_S, 2 * wait)
             await asyncio.sleep(pause * random.uniform(2 / 3, 1))
 
-    def _say(self, url: str, text: str) -> None:
+    def _warn_once(self, url: str, text: str) -> None:
         """Once, however often it is so."""
         if self._told.get(url) != text:
             self._told[url] = text
@@ -191,7 +191,7 @@ class NodeProgram:
             log.info("linked with %s", url)
             self._on_linked(url)
             self._learn(linked.urls)
-            await self._both(self._hear(url, reader, writer, linked.link), self._look(url, writer, linked))
+            await self._both(self._receive(url, reader, writer, linked.link), self._monitor(url, writer, linked))
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValidationError) as error:
             raise NodeError(f"the link to {url} ended: {str(error) or type(error).__name__}") from error
         finally:
@@ -216,7 +216,7 @@ class NodeProgram:
             engine = None
         return describe(engine, self._config.echo)
 
-    async def _hear(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, link: str) -> None:
+    async def _receive(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, link: str) -> None:
         """Do what the orchestrator says until it says nothing more."""
         ways: set[asyncio.Task[None]] = set()
         try:
@@ -239,16 +239,16 @@ class NodeProgram:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
 
-    async def _look(self, url: str, writer: asyncio.StreamWriter, linked: Linked) -> None:
+    async def _monitor(self, url: str, writer: asyncio.StreamWriter, linked: Linked) -> None:
         """Say when the engine goes and comes, and renew the certificate in time."""
         clock, doubt = _Clock(linked.time, time.monotonic()), asyncio.Event()
         self._doubts.add(doubt)
         try:
-            await self._look_again(url, writer, clock, doubt)
+            await self._poll(url, writer, clock, doubt)
         finally:
             self._doubts.discard(doubt)
 
-    async def _look_again(self, url: str, writer: asyncio.StreamWriter, clock: _Clock, doubt: asyncio.Event) -> None:
+    async def _poll(self, url: str, writer: asyncio.StreamWriter, clock: _Clock, doubt: asyncio.Event) -> None:
         away: str | None = None
         while True:
             doubt.clear()

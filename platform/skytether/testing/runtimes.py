@@ -151,9 +151,9 @@ class FakeRuntime(Runtime):
         self._answer()
         for run in self.world.values():
             run.looks += 1
-        return {instance: self._look(run) for instance, run in self.world.items()}
+        return {instance: self._observe(run) for instance, run in self.world.items()}
 
-    def _look(self, run: FakeRun) -> Observation:
+    def _observe(self, run: FakeRun) -> Observation:
         attempt = run.launch.attempt
         if run.ended:
             how: dict[str, Any] = {"exit_status": run.exit_status, "last_line": run.last_line}

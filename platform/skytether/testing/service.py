@@ -206,7 +206,7 @@ class Harness(Generic[S]):
         """As at the end of the process."""
         self.service.stop()
 
-    def take(self, topic: str, payload: bytes | memoryview) -> None:
+    def receive(self, topic: str, payload: bytes | memoryview) -> None:
         """The robot gets a message."""
         self.outputs[topic].append(decode(self._types[topic], payload, self._encoding))
 
@@ -229,7 +229,7 @@ class _Robot:
         self._harness = harness
 
     def publish(self, topic: str, payload: bytes | memoryview) -> bool:
-        self._harness.take(topic, payload)
+        self._harness.receive(topic, payload)
         return True
 
     def count_dropped(self, topic: str, count: int) -> None:
