@@ -85,11 +85,11 @@ def test_places_are_noted_each_tenth_of_a_second_and_what_passes_each_second_bot
     robot = SimpleNamespace(pose=(0.0, 0.0, 0.0))
     passed = {"up": LinkCounters(), "down": LinkCounters()}
     tracker = Tracker(robot, lambda: passed)  # type: ignore[arg-type]
-    assert [tracker.look(now) for now in (0.0, 0.05, 0.1)] == [True, False, True]
+    assert [tracker.sample(now) for now in (0.0, 0.05, 0.1)] == [True, False, True]
     robot.pose = (0.7, 0.2, 0.0)
     passed["up"].bytes_received, passed["up"].bytes_forwarded = 500_000, 250_000
     passed["down"].bytes_received, passed["down"].bytes_forwarded = 5_000, 4_000
-    assert tracker.look(2.0)
+    assert tracker.sample(2.0)
     traces = Traces(**tracker.traces())
     assert traces.way == ((0.0, 0.0), (0.0, 0.0), (0.7, 0.2))
     # 500,000 bytes within 2 s are 2 Mbit/s

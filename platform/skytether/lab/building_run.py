@@ -180,7 +180,7 @@ def drive(
         often = {"save_every": _SAVE_EVERY_S, **params.get("mapping", {})}
         params = {**params, "mapping": often}
 
-    def hear(payload: bytes | memoryview) -> None:
+    def on_status_message(payload: bytes | memoryview) -> None:
         status.update(json.loads(decode(String, payload, "cdr").data))
 
     frames = [frame(world)]
@@ -197,7 +197,7 @@ def drive(
             bind=("127.0.0.1", 0),
         )  # fmt: skip
         agent = Agent(config, base, graph=graph)
-        stack.callback(graph.subscribe("status", hear))
+        stack.callback(graph.subscribe("status", on_status_message))
         stack.enter_context(agent)
         # A scan that was matched: before that they would only queue up, and be left out.
         _wait_until(lambda: bool(status.get("scans") if mapping else status), agent)

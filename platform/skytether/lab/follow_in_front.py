@@ -83,7 +83,7 @@ class _Pictures:
         self._publish = publish
         self._drawing_s = self._publishing_s = 0.0
 
-    def take(self, topic: str, message: Message) -> None:
+    def publish(self, topic: str, message: Message) -> None:
         """In the camera's thread, which does nothing else but draw."""
         begun = time.thread_time()
         self._drawing_s = begun - self._publishing_s
@@ -121,7 +121,7 @@ class FollowTrial:
         params = RobotParams(rear=RearParams())
         self.world = Simulation(hall(), seed=settings.seed, params=params, operator=self.operator)
         pictures = _Pictures(lambda topic, message: self.rig.graph.publish(topic, message))
-        self.camera = Camera(self.world, pictures.take)
+        self.camera = Camera(self.world, pictures.publish)
         task = Task(SERVICE, settings.scenario.params, ROBOT, LIMITS, NAMES)
         observers = (self.camera.observe, self._hear_sonars)
         self.rig = Rig(settings, task, self.world, observers=observers, simulating=pictures.drawing_s)
@@ -168,7 +168,7 @@ class FollowTrial:
                     break
                 self._looks += 1
                 self._following += self.rig.status.get("state") == "following"
-                if drive.tracker.look(now):
+                if drive.tracker.sample(now):
                     self._operator_way.append(rounded(self.operator.pose[:2]))
                 on_progress(self.round, self.rig.status)
             return self._result(drive.measured(), drive)

@@ -57,13 +57,13 @@ class _Flow:
         self._sender = sender
         self.sent: list[float] = []
         self.arrived: dict[int, float] = {}
-        receiver.subscribe(name, self._take)
+        receiver.subscribe(name, self._on_message)
 
     def send(self) -> None:
         self._sender.publish(self._name, len(self.sent).to_bytes(SIZE, "big"))
         self.sent.append(time.monotonic())
 
-    def _take(self, payload: bytes | memoryview) -> None:
+    def _on_message(self, payload: bytes | memoryview) -> None:
         self.arrived[int.from_bytes(payload, "big")] = time.monotonic()
 
     def row(self, variant: str, direction: str) -> Row:

@@ -117,7 +117,7 @@ class _Found:
         """From each frame to the one that it is told in; what ``/tf`` says goes before odometry."""
         self.odometry: dict[str, _Link] = {}
 
-    def take(self, at: float, topic: BagTopic, data: bytes) -> None:
+    def add(self, at: float, topic: BagTopic, data: bytes) -> None:
         """One message that is no truth.
 
         Raises:
@@ -167,7 +167,7 @@ def _read(bag: Bag, path: Path, topic: str) -> LegBag:
                 x, y, *_, number = _PERSON.unpack(data[: _PERSON.size])
                 found.truth.append((at, number, x, y))
             else:
-                found.take(at, bag.topics[name], data)
+                found.add(at, bag.topics[name], data)
         except (DecodeError, struct.error) as error:
             raise BagError(f"{path}: a message of {name} is damaged: {error}") from error
     scans = found.scans

@@ -79,7 +79,7 @@ class _Notes:
         self._person: list[Point] = []
         self._plans: list[tuple[Point, ...]] = []
 
-    def look(self, now: float, reached: int, tracker: Tracker) -> None:
+    def sample(self, now: float, reached: int, tracker: Tracker) -> None:
         """Take what is due.
 
         Args:
@@ -88,7 +88,7 @@ class _Notes:
             tracker: The rig's.
         """
         at = len(tracker.way)
-        if tracker.look(now):
+        if tracker.sample(now):
             self._goals += [at] * (reached - len(self._goals))
             for stance in self._world.stances[:1]:
                 if self._person[-1:] != [place := rounded(stance.trunk)]:
@@ -114,7 +114,7 @@ class NineGoalsTrial:
         self.settings = settings
         self.plan = plan or building()
         self.world = Simulation(self.plan, seed=settings.seed)
-        self.rig = Rig(settings, Task(SERVICE, self._params(), ROBOT, LIMITS), self.world, self._hear)
+        self.rig = Rig(settings, Task(SERVICE, self._params(), ROBOT, LIMITS), self.world, self._on_status)
         self._notes = _Notes(self.world)
         self._mapped_at = -math.inf
         self._reached: dict[int, float] = {}
@@ -143,7 +143,7 @@ class NineGoalsTrial:
             for now in drive.passes():
                 if self.rig.status.get("state") in ("succeeded", "failed"):
                     break
-                self._notes.look(now, self._goals_reached(), drive.tracker)
+                self._notes.sample(now, self._goals_reached(), drive.tracker)
                 on_progress(self.rig.status)
             return self._result(drive.measured(), drive.tracker)
 
@@ -166,7 +166,7 @@ class NineGoalsTrial:
             **self.settings.scenario.params,
         }
 
-    def _hear(self, status: Status) -> None:
+    def _on_status(self, status: Status) -> None:
         """The service's status: it asks for a map with it, and tells which goal is next."""
         reached = status["goal"] - 1 if status["state"] != "succeeded" else status["goals"]
         self._reached.setdefault(reached, self.world.robots[0].distance)

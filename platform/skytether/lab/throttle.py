@@ -78,7 +78,7 @@ class Throttle:
             while not self._ending.wait(_STEP_S):
                 now = time.monotonic()
                 if now - found_at > _FIND_S:
-                    self._look()
+                    self._find_new()
                     found_at = now
                 if not going:
                     self.stopped_s += now - last
@@ -90,7 +90,7 @@ class Throttle:
         finally:
             self._signal(signal.SIGCONT)
 
-    def _look(self) -> None:
+    def _find_new(self) -> None:
         """Take in those that are new: what they used before is not counted."""
         pids = set(self._find())
         self._used = {pid: self._used.get(pid, cpu_time(pid)) for pid in pids}

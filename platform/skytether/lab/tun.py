@@ -112,10 +112,10 @@ class TunEmulator:
             wait = max(0.0, self._under_way[0][0] - time.monotonic()) if self._under_way else None
             for descriptor in select.select(readers, (), (), wait)[0]:
                 if descriptor != self._wake_out:
-                    self._take(self._devices.index(descriptor))
+                    self._receive(self._devices.index(descriptor))
             self._forward(time.monotonic())
 
-    def _take(self, end: int) -> None:
+    def _receive(self, end: int) -> None:
         """Take what one end sends and decide its way. Model and device have the sender's number."""
         model, device = self._models[end], self._devices[end]
         for _ in range(_TURN):

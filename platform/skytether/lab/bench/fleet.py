@@ -199,7 +199,7 @@ class _Fleet:
         began = time.monotonic()
         text = self._operator.metrics()
         scrape = time.monotonic() - began
-        exported = self._take(text)
+        exported = self._parse_metrics(text)
         self._cpu_s += cpu_seconds(self._orchestrator.pid)
         counted: Series = Counter()
         unexplained = 0
@@ -253,9 +253,9 @@ class _Fleet:
             robot.come_back()
 
     def _scrape(self) -> Series:
-        return self._take(self._operator.metrics())
+        return self._parse_metrics(self._operator.metrics())
 
-    def _take(self, text: str) -> Series:
+    def _parse_metrics(self, text: str) -> Series:
         found: Series = Counter()
         for family in text_string_to_metric_families(text):
             for sample in family.samples:

@@ -221,11 +221,11 @@ def _watched(pid: int) -> Iterator[list[float]]:
     process, over = psutil.Process(pid), Event()
     samples = [process.memory_info().rss / 2**20]
 
-    def look() -> None:
+    def sample() -> None:
         while not over.wait(_LOOK_S):
             samples.append(process.memory_info().rss / 2**20)
 
-    thread = Thread(target=look, daemon=True)
+    thread = Thread(target=sample, daemon=True)
     thread.start()
     try:
         yield samples

@@ -77,20 +77,20 @@ class Pair:
                 connect = listen
             elif emulator == "tun":
                 self._link = _start(undo, run_emulator, emulator, link, {"congestion": congestion})
-                robot_space, service_space = self._hear(self._link)
+                robot_space, service_space = self._receive(self._link)
                 listen = connect = (SERVICE, _PORT)
             else:
                 self._link = _start(undo, run_emulator, emulator, link, {"target": listen})
-                connect = self._hear(self._link)
+                connect = self._receive(self._link)
             made = (listen, Role.SERVICE, service_space), (connect, Role.ROBOT, robot_space)
             ends = []
             for address, role, namespace in made:
                 spec = EndSpec(role, address, self._flows, folder, options or {})
                 ends.append(_start(undo, run_end, transport, spec, namespace))
-                self._hear(ends[-1])
+                self._receive(ends[-1])
             self._service, self._robot = ends
             for end in ends:
-                self._hear(end)
+                self._receive(end)
             self._undo = undo.pop_all()
 
     def measure(
@@ -114,7 +114,7 @@ class Pair:
             end.send(order)
         before, _ = self._counters_at(order.start)
         after, late = self._counters_at(order.end)
-        robot, service = self._hear(self._robot), self._hear(self._service)
+        robot, service = self._receive(self._robot), self._receive(self._service)
         run = Run(
             self._transport,
             condition or self._condition,
@@ -145,13 +145,13 @@ class Pair:
         if self._link is None:
             return None, None
         self._link.send("counters")
-        both: list[LinkCounters] = list(self._hear(self._link).values())
+        both: list[LinkCounters] = list(self._receive(self._link).values())
         return (
             sum(c.bytes_received + c.received * IP_UDP_HEADERS for c in both),
             round(max(c.late_max for c in both) * 1000, 3),
         )
 
-    def _hear(self, pipe: Connection) -> Any:
+    def _receive(self, pipe: Connection) -> Any:
         try:
             answer = pipe.recv()
         except EOFError:

@@ -131,7 +131,7 @@ def bench_resize(
             wait_for(lambda: agent.source is Source.CLOUD, agent)
             gc.freeze()  # as a robot's program does
             instance = instance_of(agent)
-            operators.submit(_look, access, instance, 0.0).result()  # it is there, and has imported all
+            operators.submit(_poll, access, instance, 0.0).result()  # it is there, and has imported all
             robot_first = _robot_first()
             with _loaded(instance, runtime):
                 for i in range(n):
@@ -146,7 +146,7 @@ def bench_resize(
                     fallbacks += len(agent.status().driver.transitions) > before
                     on_resize(i, gaps[-1])
                     time.sleep(2 * _AROUND_S)
-                    began = operators.submit(_look, access, instance, took[-1]).result()
+                    began = operators.submit(_poll, access, instance, took[-1]).result()
                     time.sleep(_AROUND_S)
                     still.append(seen.longest_gap_ms(began - _AROUND_S, began + took[-1] + _AROUND_S))
             with Client(*access) as operator:
@@ -192,7 +192,7 @@ def _change(access: tuple[str, str], instance: str, size: Size) -> tuple[float, 
         return began, time.monotonic()
 
 
-def _look(access: tuple[str, str], instance: str, seconds: float) -> float:
+def _poll(access: tuple[str, str], instance: str, seconds: float) -> float:
     """Ask as often as while it is changed; since when."""
     with Client(*access) as operator:
         began = time.monotonic()

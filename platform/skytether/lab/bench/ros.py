@@ -190,13 +190,13 @@ def _wait(scene: _Scene) -> None:
     deadline = time.monotonic() + _CONNECT_S
     for node in (scene.talker, scene.listener):
         while not node.connected():
-            _look(scene, deadline)
+            _check_and_sleep(scene, deadline)
     indices = list(range(len(MESSAGES)))
     while _run(scene, indices, _TRY_S, 0.0).kinds != set(indices):
-        _look(scene, deadline)
+        _check_and_sleep(scene, deadline)
 
 
-def _look(scene: _Scene, deadline: float) -> None:
+def _check_and_sleep(scene: _Scene, deadline: float) -> None:
     for end, log in zip(scene.ends, scene.logs, strict=True):
         if not end.is_running() or end.status() == psutil.STATUS_ZOMBIE:
             raise BenchError(f"an end of the bridge ended: {log.read_text().strip()}")

@@ -84,8 +84,8 @@ class Node:
         self._thread = threading.Thread(target=self._listen, name="ros2", daemon=True)
         self._thread.start()
         try:
-            self._tell(wanted)
-            self._hear()
+            self._send(wanted)
+            self._receive()
         except TransportError:
             self.stop()
             raise
@@ -104,7 +104,7 @@ class Node:
 
     def begin(self, order: Order, sends: Sequence[int]) -> None:
         """Let it send these flows of an order, and listen."""
-        self._tell(
+        self._send(
             {
                 "flows": [{"size": flow.size, "hz": flow.hz} for flow in order.flows],
                 "begin": order.begin,
@@ -120,7 +120,7 @@ class Node:
         Raises:
             TransportError: The program ended.
         """
-        noted = self._hear()
+        noted = self._receive()
         sent = {int(i): times for i, times in noted["sent"].items()}
         received = {int(i): [(n, at, now) for n, at, now in got] for i, got in noted["received"].items()}
         return Notes(sent, received, noted["cpu_s"])
@@ -151,12 +151,12 @@ class Node:
             self._process.wait()
         self._thread.join()
 
-    def _tell(self, what: Mapping[str, Any]) -> None:
+    def _send(self, what: Mapping[str, Any]) -> None:
         if self._process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):  # its last words are read next
                 print(json.dumps(what), file=self._process.stdin, flush=True)
 
-    def _hear(self) -> Any:
+    def _receive(self) -> Any:
         return self._checked(self._answers.get())
 
     def _checked(self, answer: Any) -> Any:

@@ -184,7 +184,7 @@ class _Bench:
     ) -> None:
         self._idle_s, self._asking = idle_s, asking
         self._orchestrators, self._clients, self._token, self._address = orchestrators, clients, token, address
-        self._say = on_progress
+        self._on_progress = on_progress
         self._robots = 0
         self._held: list[str] = []
         self._rng = np.random.default_rng(_SEED)
@@ -206,7 +206,7 @@ class _Bench:
     def level(self, instances: int) -> ScaleRow:
         """Start what is missing, and measure."""
         asked = self._fill(instances)
-        self._say(f"{instances} instances run, nobody asks")
+        self._on_progress(f"{instances} instances run, nobody asks")
         before = calls(self._address)
         leader = self._orchestrators[self._leads]
         written, busy = len(leader.log), self._cpu()
@@ -217,11 +217,11 @@ class _Bench:
         if not passes.get(f"site-{_SITE}") or not passes.get("placer"):
             raise BenchError("the reconciler made no pass")
         memory = psutil.Process(leader.pid).memory_info().rss / 2**20
-        self._say(f"{instances} instances run, robots renew")
+        self._on_progress(f"{instances} instances run, robots renew")
         busy = self._cpu()
         renewals = self._renew()
         renew_cpu = self._cpu() - busy - cpu * self._idle_s
-        self._say(f"{instances} instances run, some robots ask")
+        self._on_progress(f"{instances} instances run, some robots ask")
         cold = self._wait_for(_SERVICE)
         warm = self._warm()
         pass_ms, placer_ms = max(passes[f"site-{_SITE}"]), max(passes["placer"])
@@ -282,7 +282,7 @@ class _Bench:
         with ThreadPoolExecutor(1) as pool:
             asking = pool.submit(self._ask, self._names(missing))
             while (up := self._count(_SERVICE, "starting") - before) < missing:
-                self._say(f"{len(self._held) + up} of {instances} instances run")
+                self._on_progress(f"{len(self._held) + up} of {instances} instances run")
                 if time.monotonic() - began > _LIMIT_S:
                     raise BenchError(f"only {up} of {instances} instances ran within {_LIMIT_S:.0f} s")
                 time.sleep(_LOOK_S + missing / 2000)
@@ -345,11 +345,11 @@ class _Bench:
 
     def crowd(self, count: int, kubeconfig: Path) -> float:
         """Instances that are given a site in a second, counted from when room comes for a crowd that waits."""
-        self._say(f"{count} robots wait for room")
+        self._on_progress(f"{count} robots wait for room")
         self._operator.put_service("crowd", _manifest("crowd", tiers=["cloud"]))
         self._operator.create_site(_site("small", kubeconfig, tier="cloud", cpu=0.001))  # one has room
         made = self._ask(self._names(count), "crowd")
-        self._say(f"{count} instances are given a site")
+        self._on_progress(f"{count} instances are given a site")
         room = time.time()
         self._operator.create_site(_site("large", kubeconfig, tier="cloud"))
         began = time.monotonic()

@@ -107,7 +107,7 @@ class Ros1Hardware:
 
     def appear(self) -> None:
         """Hardware: subscribe."""
-        self._gone = self._node.subscribe(_WHEELS, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), Listener(self._take))
+        self._gone = self._node.subscribe(_WHEELS, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), Listener(self._on_velocity))
 
     def close(self) -> None:
         """Hardware: leave the graph, end the master."""
@@ -120,14 +120,14 @@ class Ros1Hardware:
         except (OSError, Error):
             return False
 
-    def _take(self, data: bytes, _: object) -> None:
+    def _on_velocity(self, data: bytes, _: object) -> None:
         if not self._looks:
             self._looks = True
-            self._look()
+            self._note_turn()
         twist = decode(Twist, data, "ros1")
         # Of the look in the same turn of the thread's loop nobody knows whether it was before or after the message.
         self.record.add(SentVelocity(now(), Velocity(twist.linear.x, twist.angular.z), earliest=self._looked[0]))
 
-    def _look(self) -> None:
+    def _note_turn(self) -> None:
         self._looked.append(now())
-        asyncio.get_running_loop().call_later(_LOOK_S, self._look)
+        asyncio.get_running_loop().call_later(_LOOK_S, self._note_turn)

@@ -66,15 +66,15 @@ class Ros2Hardware:
 
     def send(self, topic: str, message: Message) -> None:
         """Hardware: publish it."""
-        self._tell(do="send", topic=topic, data=base64.b64encode(encode(message)).decode())
+        self._send(do="send", topic=topic, data=base64.b64encode(encode(message)).decode())
 
     def vanish(self) -> None:
         """Hardware: subscribe no more."""
-        self._tell(do="vanish")
+        self._send(do="vanish")
 
     def appear(self) -> None:
         """Hardware: subscribe."""
-        self._tell(do="appear")
+        self._send(do="appear")
 
     def freeze(self) -> None:
         """The node's program stands still."""
@@ -86,11 +86,11 @@ class Ros2Hardware:
 
     def intrude(self) -> None:
         """Another node listens to the velocities, as if they were of another type."""
-        self._tell(do="intrude")
+        self._send(do="intrude")
 
     def leave(self) -> None:
         """That one is gone."""
-        self._tell(do="leave")
+        self._send(do="leave")
 
     def close(self) -> None:
         """Hardware: leave the graph."""
@@ -101,7 +101,7 @@ class Ros2Hardware:
             with suppress(BrokenPipeError):
                 self._process.stdin.close()
 
-    def _tell(self, **what: Any) -> None:
+    def _send(self, **what: Any) -> None:
         with self._lock, suppress(OSError):
             print(json.dumps(what), file=self._process.stdin, flush=True)
 
@@ -109,10 +109,10 @@ class Ros2Hardware:
         if self._process.stdout is not None:
             with self._process.stdout as answers:
                 for line in answers:
-                    self._hear(json.loads(line))
+                    self._on_answer(json.loads(line))
         self._joined.set()
 
-    def _hear(self, said: Any) -> None:
+    def _on_answer(self, said: Any) -> None:
         if not self._joined.is_set():  # it is ready
             self._joined.set()
             return

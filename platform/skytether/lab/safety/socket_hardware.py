@@ -118,9 +118,9 @@ class SocketHardware:
                 continue
             except OSError:  # it vanished meanwhile
                 continue
-            self._take(data, more)
+            self._on_velocity(data, more)
 
-    def _take(self, data: bytes, more: list[tuple[int, int, bytes]]) -> None:
+    def _on_velocity(self, data: bytes, more: list[tuple[int, int, bytes]]) -> None:
         try:
             twist = decode(Twist, data)
         except DecodeError:

@@ -139,7 +139,7 @@ class Rig:
                 route=self._through_network,
             )
             self.agent = Agent(config, self.base, graph=self.graph)
-            stack.callback(self.graph.subscribe("status", self._hear))
+            stack.callback(self.graph.subscribe("status", self._on_message))
             stack.enter_context(self.agent)
             self._stack = stack.pop_all()
         return self
@@ -177,7 +177,7 @@ class Rig:
             return nullcontext()
         return Throttle(cpu, lambda: children_of(self.orchestrator.pid))
 
-    def _hear(self, payload: bytes | memoryview) -> None:
+    def _on_message(self, payload: bytes | memoryview) -> None:
         status: dict[str, Any] = json.loads(decode(String, payload, "cdr").data)
         self._on_status(status)
         self.status = status

@@ -31,7 +31,7 @@ class Tracker:
         self._kbit: list[list[float]] = [[], [], [], []]
         self.way: list[Point] = []
 
-    def look(self, now: float) -> bool:
+    def sample(self, now: float) -> bool:
         """Take what is due.
 
         Args:

@@ -228,7 +228,7 @@ class Camera:
             self._ready.set()
             while (state := self._next()) is not None:
                 begun = time.perf_counter()
-                self._take(renderer, data, state)
+                self._capture(renderer, data, state)
                 self.taken += 1
                 self.drawing_s += time.perf_counter() - begun
         except Exception as error:
@@ -248,7 +248,7 @@ class Camera:
             state, self._waiting, self._busy = self._waiting, None, True
             return state
 
-    def _take(self, renderer: Renderer, data: Any, state: State) -> None:
+    def _capture(self, renderer: Renderer, data: Any, state: State) -> None:
         data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = state.qpos, state.mocap_pos, state.mocap_quat
         picture = self._sensor.noisy(renderer.draw(data))
         coded = np.frombuffer(self._sensor.jpeg(picture), np.uint8)

@@ -155,12 +155,12 @@ class Operator:
         self._seen.append(_Seen(self._time, robot, Motion(self._robot_speed, 0.0, motion.turning)))
         while len(self._seen) > 1 and self._time - self._seen[1].at >= self.params.reaction:
             self._seen.popleft()
-        self._look(robot, dt)
+        self._turn_head(robot, dt)
         moved = self._walk(robot, dt)
         self._gait.step(self.pose, moved, dt)
         return self.figure
 
-    def _look(self, robot: Pose, dt: float) -> None:
+    def _turn_head(self, robot: Pose, dt: float) -> None:
         p = self.params
         kept = math.exp(-dt / p.wander_time)
         self._wander = kept * self._wander + p.wander * math.sqrt(1 - kept**2) * float(self._random.normal())

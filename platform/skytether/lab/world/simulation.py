@@ -229,7 +229,7 @@ class Simulation:
                 self._push(robot)
             self._mujoco.mj_step(self._model, self._data)
             if self._data.ncon:
-                self._look(self.time + (step + 1) * PHYSICS_STEP)
+                self._judge_contacts(self.time + (step + 1) * PHYSICS_STEP)
         self.ticks += 1
         # Positions are those of the end of the step, what was computed of them is not yet: rays need it.
         self._mujoco.mj_kinematics(self._model, self._data)
@@ -294,7 +294,7 @@ class Simulation:
             for body, (x, y) in zip(bodies, stance, strict=True):
                 self._data.mocap_pos[body] = (x, y, 0.0)
 
-    def _look(self, at: float) -> None:
+    def _judge_contacts(self, at: float) -> None:
         force = np.zeros(6)
         for index in range(self._data.ncon):
             contact = self._data.contact[index]

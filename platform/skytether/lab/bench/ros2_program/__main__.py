@@ -18,23 +18,23 @@ def _main() -> None:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # libraries write to standard output; answers only go where answers are read
 
-    def say(answer: Any) -> None:
+    def send(answer: Any) -> None:
         answers.write(json.dumps(answer) + "\n")
 
     told = json.loads(sys.stdin.readline())
     wanted = Wanted(**{**told, "flows": [Flow(**flow) for flow in told["flows"]]})
     journal = Journal(wanted.receives)
     graph = _join(wanted, journal)
-    say("started")
+    send("started")
     while not graph.connected():
         time.sleep(_LOOK_S)
-    say("connected")
+    send("connected")
     for line in sys.stdin:
         order = json.loads(line)
         order["flows"] = [Flow(**flow) for flow in order["flows"]]
         sends = order.pop("sends")
         sent, used = journal.measure(Order(**order), sends, graph.publish)
-        say({"sent": sent, "received": journal.received, "cpu_s": used})
+        send({"sent": sent, "received": journal.received, "cpu_s": used})
     graph.close()
 
 

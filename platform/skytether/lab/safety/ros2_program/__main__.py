@@ -72,7 +72,9 @@ class _Played:
 
     def _do_appear(self) -> None:
         kind = TwistStamped if self._stamped else Twist
-        self._subscription = self._node.create_subscription(kind, self._wheels, self._take, QoSProfile(depth=_DEPTH))
+        self._subscription = self._node.create_subscription(
+            kind, self._wheels, self._on_velocity, QoSProfile(depth=_DEPTH)
+        )
 
     def _do_intrude(self) -> None:
         context = rclpy.Context()  # a participant of its own: one has a topic with one type only
@@ -83,7 +85,7 @@ class _Played:
     def _do_leave(self) -> None:
         self._stranger.destroy_node()
 
-    def _take(self, message: Any, info: Any) -> None:
+    def _on_velocity(self, message: Any, info: Any) -> None:
         taken = _since_start()
         ago = time.time() - info["source_timestamp"] * 1e-9
         twist = message.twist if self._stamped else message
