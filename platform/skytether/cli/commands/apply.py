@@ -47,7 +47,7 @@ def apply(
     """
     documents = _read(file)
     with connected(url, token_file) as client:
-        looked = _look(client, documents)
+        looked = _dry_run(client, documents)
         done = looked if dry_run else _store(client, documents)
     if json:
         print_json([{**manifest, "result": change} for manifest, change in done])
@@ -57,7 +57,7 @@ def apply(
         console.print(f"[{_COLOURS[change]}]{change:>9}[/]  service {document.name}, version {version}")
 
 
-def _look(client: Client, documents: list[_Document]) -> list[tuple[Any, Change]]:
+def _dry_run(client: Client, documents: list[_Document]) -> list[tuple[Any, Change]]:
     """Have the orchestrator check all of them; ends with every sentence on what is wrong."""
     from skytether.api.client import ApiError
 

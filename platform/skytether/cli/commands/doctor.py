@@ -18,7 +18,7 @@ from skytether.robot.diagnosis.doctor import Finding
 
 from ..connection import Json, transport
 from ..output import console, fail, print_json
-from .robot.check import look
+from .robot.check import check_run
 
 if TYPE_CHECKING:
     from skytether.robot.config.robot_config import RobotConfig
@@ -50,7 +50,7 @@ def doctor(
     if config is None and url is None and echo is None:
         fail("give a robot.yaml, the address of an orchestrator with --url, or an echo with --echo", 2)
     try:
-        findings = list(_look(config, url, ca_file, echo))
+        findings = list(_examine(config, url, ca_file, echo))
     except ConfigError as error:
         fail(str(error), 2)
     if json:
@@ -66,7 +66,7 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str | None) -> Iterator[Finding]:
+def _examine(config: Path | None, url: str | None, ca_file: Path | None, echo: str | None) -> Iterator[Finding]:
 
     settings = load_config(config) if config is not None else None
     if settings is not None:
@@ -101,7 +101,7 @@ def _look(config: Path | None, url: str | None, ca_file: Path | None, echo: str 
 def _graph(settings: RobotConfig, folder: Path, token: str) -> Iterator[Finding]:
     """The robot's graph: whether it is there, and the types of what the service takes and gives."""
     try:
-        found = [f for f in look(settings, folder, token, "doctor") if f.what != "orchestrator"]
+        found = [f for f in check_run(settings, folder, token, "doctor") if f.what != "orchestrator"]
     except ConfigError as error:
         yield _trouble("ros graph", str(error), settings.kind.todo)
         return

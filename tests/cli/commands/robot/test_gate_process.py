@@ -15,7 +15,7 @@ class Own:
     def __init__(self, config, safety, *, assumed):
         self.assumed, self.closed = assumed, False
 
-    def look(self):
+    def ensure_running(self):
         return "own"
 
     def close(self):
@@ -41,7 +41,7 @@ class Robot:
     def look(self, seconds):
         for _ in range(round(seconds / 0.5)):
             self.now += 0.5
-            said = self.gate.look()
+            said = self.gate.ensure_running()
         return said
 
 
@@ -115,7 +115,7 @@ class Started:
     def look(self, seconds):
         for _ in range(round(seconds / 0.5)):
             self.now += 0.5
-            self.gate.look()
+            self.gate.ensure_running()
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def test_where_a_reboot_forgets_a_stop_the_start_of_the_robot_is_no_reset(monkey
     started = Started(monkeypatch, lost="it is on a tmpfs")
     started.stopped = FIRST_ACT
     started.gate.wait()
-    assert "on a tmpfs" in started.gate.look()
+    assert "on a tmpfs" in started.gate.ensure_running()
     started.look(50.0)
     assert set(started.asked) == {"status"}
 

@@ -31,7 +31,7 @@ def building(
     """
     from skytether.lab.building_run import ParamsError, drive, read_params
 
-    def tell(now: float, status: Mapping[str, Any]) -> None:
+    def print_status(now: float, status: Mapping[str, Any]) -> None:
         if not json:
             code = "" if status.get("code") in ("ok", None) else f" ({status['code']})"
             line = f"{now:6.1f} s  {status['state']}{code}: {status.get('message', '')}"
@@ -40,7 +40,7 @@ def building(
     try:
         wanted, readable = read_params(params)
         with console.status("driving ..."):
-            done = drive(wanted, output, readable=readable, seconds=seconds, seed=seed, on_status=tell)
+            done = drive(wanted, output, readable=readable, seconds=seconds, seed=seed, on_status=print_status)
     except (ParamsError, WorldError) as error:
         fail(str(error), 2)
     except (TrialError, EmbeddedError, ApiError, Unreachable) as error:

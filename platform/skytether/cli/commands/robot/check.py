@@ -19,14 +19,14 @@ from ...output import cell, console, print_whole
 from .gate_process import ASSUMED, NO_GATE
 
 
-def look(settings: RobotConfig, folder: Path, token: str, role: str = "check") -> list[Finding]:
+def check_run(settings: RobotConfig, folder: Path, token: str, role: str = "check") -> list[Finding]:
     """Everything that a run will need, one by one.
 
     Args:
         settings: The file.
         folder: That its paths are relative to.
         token: The robot's.
-        role: Who looks.
+        role: Who checks.
 
     Raises:
         ConfigError: The graph cannot be joined.

@@ -50,7 +50,7 @@ def commission(
         button=settings.estop is not None,
         enable=settings.enable is not None,
     )
-    work = Commission(plan, rig, _ask, _say)
+    work = Commission(plan, rig, _ask, _print)
     known = work.steps()
     done: list[Step] = []
     stopped = ""
@@ -59,13 +59,13 @@ def commission(
         unknown = [name for name in wanted if name not in known]
         if unknown:
             fail(f"there is no step '{unknown[0]}'; there are {', '.join(known)}", 2)
-        _say("No sensor looks where the robot goes. Keep a hand on the emergency stop and the way free.")
+        _print("No sensor looks where the robot goes. Keep a hand on the emergency stop and the way free.")
         for name in wanted:
             done.append(known[name]())
-            _say(f"{name}: {_word(done[-1].ok)}: {done[-1].says}")
+            _print(f"{name}: {_word(done[-1].ok)}: {done[-1].says}")
     except (CommissionError, KeyboardInterrupt) as error:
         stopped = str(error) or "ended by the person"
-        _say(f"ended: {stopped}")
+        _print(f"ended: {stopped}")
     finally:
         rig.close()
     document = {
@@ -95,10 +95,10 @@ def _word(ok: bool | None) -> str:
     return "left out" if ok is None else "good" if ok else "FAILED"
 
 
-def _say(sentence: str) -> None:
+def _print(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
 def _ask(question: str) -> bool:
-    _say(f"{question} [y/N]")
+    _print(f"{question} [y/N]")
     return sys.stdin.readline().strip().lower() in ("y", "yes")

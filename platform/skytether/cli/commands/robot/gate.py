@@ -61,13 +61,13 @@ def safety_log(
         return
     for event in events:
         when = datetime.fromtimestamp(float(str(event.get("wall", 0))), UTC).astimezone()
-        _say(
+        _print(
             f"{when:%Y-%m-%d %H:%M:%S}  {event.get('who', ''):<7} {event.get('what', ''):<8} {event.get('detail', '')}"
         )
         if lost := event.get("lost_before"):
-            _say(f"{'':21}before this, {lost} events were lost")
+            _print(f"{'':21}before this, {lost} events were lost")
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     """A line, some of which others may have written: the reason of a stop, say."""
     print_foreign(f"{line}\n")

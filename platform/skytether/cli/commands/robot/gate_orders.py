@@ -69,32 +69,32 @@ def gate_status(folder: Folder = None, json: Json = False) -> None:
         return
     nothing = "not all of it is seen" if answer["zone"] == "unknown" else "nothing near"
     way = nothing if answer["way_m"] is None else f"{answer['way_m']:.2f} m to the stop zone"
-    _say(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
-    _say(f"ahead     {answer['zone']}: {way}")
-    _say(f"stopped   {answer['stopped'] or 'no'}")
+    _print(f"drives    {answer['hand']}: {answer['linear_m_s']:.3f} m/s, {answer['angular_rad_s']:.3f} rad/s")
+    _print(f"ahead     {answer['zone']}: {way}")
+    _print(f"stopped   {answer['stopped'] or 'no'}")
     enabled = (answer.get("guard") or {}).get("enabled")
     if enabled is not None:
-        _say(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
+        _print(f"power     {'the enable signal changes' if enabled else 'off: the enable signal stands still'}")
     if answer.get("modes"):
-        _say(f"modes     {', '.join(answer['modes'])}")
+        _print(f"modes     {', '.join(answer['modes'])}")
     for source, why in answer["waiting"].items():
-        _say(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
+        _print(f"waiting   {source}: must want a standstill first, after {why}; or: skytether robot start")
     for sentence in answer["beyond"]:
-        _say(f"beyond    {sentence}")
+        _print(f"beyond    {sentence}")
     guard = answer["guard"]
     if guard is None:
-        _say("guard     does not answer; the gate stops the wheels itself")
+        _print("guard     does not answer; the gate stops the wheels itself")
     else:
         restarts = f", after {guard['gate_restarts']} deaths of the gate" if guard["gate_restarts"] else ""
-        _say(f"guard     process {guard['pid']}, gate {answer['pid']}{restarts}")
+        _print(f"guard     process {guard['pid']}, gate {answer['pid']}{restarts}")
     if answer["stopped"] and answer["kept"] is False:
-        _say("trouble   the emergency stop is not on disk: it would not outlive the guard")
+        _print("trouble   the emergency stop is not on disk: it would not outlive the guard")
     troubles = [*answer["troubles"], *(guard["troubles"] if guard else [])]
     for sentence in dict.fromkeys(troubles):
-        _say(f"trouble   {sentence}")
+        _print(f"trouble   {sentence}")
     notes = [*answer["not_permitted"], *(guard["not_permitted"] + guard["notes"] if guard else [])]
     for sentence in dict.fromkeys(notes):
-        _say(f"note      {sentence}")
+        _print(f"note      {sentence}")
 
 
 def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:
@@ -105,6 +105,6 @@ def _ask(folder: Path | None, request: dict[str, Any]) -> dict[str, Any]:
         fail(str(error))
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     """A line, some of which others may have written: the reason of a stop, say."""
     print_foreign(f"{line}\n")

@@ -121,7 +121,7 @@ class OwnGate:
         if self._clock() < self._assumed_until:
             self._let_go(start=False)
 
-    def look(self) -> str:
+    def ensure_running(self) -> str:
         """Start it again if it has ended by itself. Returns a sentence about that; empty: it runs, or another does."""
         status, now = self._process.poll(), self._clock()
         if status is None:
@@ -207,10 +207,10 @@ class FoundGate:
         self._gone_at: float | None = None
         self._own: OwnGate | None = None
 
-    def look(self) -> str:
+    def ensure_running(self) -> str:
         """Start one if it has ended. Returns a sentence about that; empty: it runs."""
         if self._own is not None:
-            return self._own.look()
+            return self._own.ensure_running()
         now = self._clock()
         if self._there(self._safety.place()):
             self._gone_at = None

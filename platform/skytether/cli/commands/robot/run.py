@@ -29,7 +29,7 @@ from skytether.robot.safety.client import GateLink
 
 from ...output import console, fail
 from ...ros_words import RosWords, given
-from .check import look, show
+from .check import check_run, show
 from .gate_process import gate
 from .never_wait import never_wait
 
@@ -73,7 +73,7 @@ def run(
             settings = load_config(config, words := more)
         token = load_token(settings, config.parent)
         if check:
-            raise typer.Exit(0 if show(look(settings, config.parent, token)) else 1)
+            raise typer.Exit(0 if show(check_run(settings, config.parent, token)) else 1)
         _run(settings, config, token, seconds, words)
     except ConfigError as error:
         fail(str(error), 2)
@@ -148,7 +148,7 @@ def _watch(
             before = now
         if ended.wait(_STATUS_S):
             return
-        trouble = gate.look() if gate is not None else ""
+        trouble = gate.ensure_running() if gate is not None else ""
         if trouble:
             console.print(f"error: {trouble}", markup=False, soft_wrap=True)
 

@@ -91,12 +91,12 @@ def remove_site(
             deadline, told = time.monotonic() + timeout_s, ""
             while wait and not gone:
                 try:
-                    left = _left(site) if (site := _look(client, name)) else "no orchestrator answers"
+                    left = _left(site) if (site := _get_site(client, name)) else "no orchestrator answers"
                 except ApiError as error:
                     if error.problem.status != HTTPStatus.NOT_FOUND:
                         raise
                     break
-                told = _tell(left, told)
+                told = _print_new(left, told)
                 if time.monotonic() >= deadline:
                     fail(f"{left}: site {name} goes with its last instance; with --force it goes now")
                 time.sleep(_POLL_S)
@@ -126,15 +126,15 @@ def _until(client: Client, site: Site, missing: Callable[[Site], str], timeout_s
     """
     deadline, told = time.monotonic() + timeout_s, ""
     while text := missing(site):
-        told = _tell(text, told)
+        told = _print_new(text, told)
         if time.monotonic() >= deadline:
             fail(text + advice)
         time.sleep(_POLL_S)
-        site = _look(client, site.name) or site
+        site = _get_site(client, site.name) or site
     return site
 
 
-def _look(client: Client, name: str) -> Site | None:
+def _get_site(client: Client, name: str) -> Site | None:
     """A site as it is now; None: no orchestrator answers, as while it is updated.
 
     Raises:
@@ -152,7 +152,7 @@ def _look(client: Client, name: str) -> Site | None:
         return None
 
 
-def _tell(text: str, told: str) -> str:
+def _print_new(text: str, told: str) -> str:
     if text != told:
         console.print(text, markup=False)
     return text
