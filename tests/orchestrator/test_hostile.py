@@ -31,8 +31,8 @@ from skytether.api.rest import SCOPES, InstanceCreate, RobotCreate, State, Token
 pytestmark = pytest.mark.slow
 
 LEASE = 3.0
-"""Seconds; an attack lasts for several of them."""
-ATTACK = 6.0
+"""Seconds; an attack lasts for longer."""
+ATTACK = 4.5
 SLOW_BODY = (
     b"POST /api/v1/instances HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n"
 )

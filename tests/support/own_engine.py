@@ -16,6 +16,8 @@ import time
 from pathlib import Path
 
 PATIENCE = 30.0
+_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+"""For the engine: a runtime that is a script is begun by the system's Python, several times for each container."""
 
 
 class OwnEngine:
@@ -36,7 +38,7 @@ class OwnEngine:
         command = [*self._inside, "dockerd", "-H", self.address, *_as_the_machines_own(), *flags]
         command += [f"--{name}={self.folder}/{name}" for name in ("data-root", "exec-root", "pidfile")]
         with (self.folder / "log").open("ab") as log:
-            self._process = subprocess.Popen(command, stdout=log, stderr=log)
+            self._process = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, "PATH": _PATH})
         deadline = time.monotonic() + PATIENCE
         while subprocess.run(["docker", "-H", self.address, "version"], capture_output=True).returncode:
             assert self._process.poll() is None, (self.folder / "log").read_text()

@@ -472,7 +472,8 @@ def test_killed_at_any_change_it_neither_leaks_nor_doubles(made: Made) -> None:
                 pass
         bench.restart()
         life(bench)
-        life(bench)
+        if not nothing_left(bench) or bench.states():  # who was served at last goes in the next one
+            life(bench)
         assert nothing_left(bench), number
         orders = [order.name for order in bench.cloud.orders]
         assert len(orders) == len(set(orders)) <= 4, number
