@@ -215,7 +215,7 @@ def test_an_idle_session_keeps_its_binding_where_others_lose_theirs(nat, session
 
 def test_a_load_balancer_that_comes_later_than_the_robot_is_got_through(nat, ends, monkeypatch):
     """Its rule is for new flows only; a robot that asks again and again from one port never is one."""
-    monkeypatch.setattr(driver, "_OTHER_PORT_S", 1.0)
+    monkeypatch.setattr(driver, "OTHER_PORT_S", 1.0)
     service = ends.make(Role.SERVICE, bind=(CLOUD, 0))
     nat.cloud.run(service.start)
     robot = ends.make(Role.ROBOT, bind=("0.0.0.0", 0), peer=("203.0.113.50", 7600))

@@ -43,7 +43,7 @@ def kernel(request, monkeypatch):
     """One that refuses descriptors, and one that does not know how to."""
     if request.param == "held":
         monkeypatch.setattr(descriptors, "REFUSED", False)
-        monkeypatch.setattr(descriptors, "_SO_PASSRIGHTS", 9999)
+        monkeypatch.setattr(descriptors, "SO_PASSRIGHTS", 9999)
     elif not descriptors.REFUSED:
         pytest.skip("this kernel has no SO_PASSRIGHTS")
     return request.param
@@ -189,7 +189,7 @@ def test_a_child_that_sends_descriptors_holds_the_guard_up_for_no_time(kernel, l
 def test_where_there_is_no_room_for_descriptors_the_socket_is_silent(monkeypatch, tmp_path):
     """To take the message would close those for good that do not fit."""
     monkeypatch.setattr(descriptors, "REFUSED", False)
-    monkeypatch.setattr(descriptors, "_SO_PASSRIGHTS", 9999)
+    monkeypatch.setattr(descriptors, "SO_PASSRIGHTS", 9999)
     own = bind(str(tmp_path / "s"))
     files = [socket.socket() for _ in range(8)]
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -212,9 +212,9 @@ def test_where_there_is_no_room_for_descriptors_the_socket_is_silent(monkeypatch
 
 
 def test_too_many_that_wait_to_be_closed_leave_the_socket_silent(monkeypatch, lingering, tmp_path):
-    monkeypatch.setattr(descriptors, "_CLOSER", descriptors.Closer(most=2))
+    monkeypatch.setattr(descriptors, "CLOSER", descriptors.Closer(most=2))
     monkeypatch.setattr(descriptors, "REFUSED", False)
-    monkeypatch.setattr(descriptors, "_SO_PASSRIGHTS", 9999)
+    monkeypatch.setattr(descriptors, "SO_PASSRIGHTS", 9999)
     own = bind(str(tmp_path / "s"))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         behind = socket.socket()

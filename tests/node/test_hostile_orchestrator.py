@@ -153,7 +153,7 @@ def test_who_has_left_is_linked_no_more_whatever_an_orchestrator_says(
     hostile: Hostile, left: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where no unit runs the node's program, and nobody ended that."""
-    monkeypatch.setattr(run, "_LOOK_S", 0.05)
+    monkeypatch.setattr(run, "LOOK_S", 0.05)
     linked, ended = threading.Event(), threading.Event()
 
     def stay(link: ssl.SSLSocket) -> None:

@@ -294,10 +294,10 @@ def later() -> Later:
 @pytest.fixture
 def nodes(tmp_path: Path, server: Server, later: Later, monkeypatch: pytest.MonkeyPatch) -> Iterator[NodeScene]:
     """An orchestrator that machines join, and its machines, which wait a tenth of what they would."""
-    monkeypatch.setattr(node_join, "_POLL_S", 0.02)
-    monkeypatch.setattr(node_join, "_LEFT_S", 0.1)
-    monkeypatch.setattr(node_run, "_AGAIN_S", 0.1)
-    monkeypatch.setattr(node_run, "_LOOK_AWAY_S", 0.1)
+    monkeypatch.setattr(node_join, "POLL_S", 0.02)
+    monkeypatch.setattr(node_join, "LEFT_S", 0.1)
+    monkeypatch.setattr(node_run, "AGAIN_S", 0.1)
+    monkeypatch.setattr(node_run, "LOOK_AWAY_S", 0.1)
     ReachedRuntime.worlds.clear()
     state = tmp_path / "state"
     state.mkdir(mode=0o700)

@@ -83,7 +83,7 @@ def test_one_that_says_nothing_holds_up_nobody_for_long(grant: Grant) -> None:
 def test_strangers_keep_the_cluster_from_no_answer_however_slowly_and_many_they_ask(
     grant: Grant, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(health_port, "_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(health_port, "TIMEOUT_S", 1.0)
     Path(str(grant.ready_file)).write_text("{}")
     done = threading.Event()
 

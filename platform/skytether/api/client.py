@@ -55,7 +55,7 @@ _PING_LIMIT = 45.0
 _RESUME_S = 30.0
 """How long an event stream that was lost is tried again [s]: an orchestrator is restarted in less."""
 _RESUME_PAUSE_S = 0.2
-_END_SEEN_S = 1.0
+END_SEEN_S = 1.0
 """By when an orchestrator has seen that a run has ended [s]."""
 
 
@@ -136,7 +136,7 @@ class Client(Connection):
                     if "content-length" in response.headers:
                         return  # nothing runs, or it cannot be followed: that was all there is
                 # The stream has ended with the run, or with the orchestrator; which, is known a moment later.
-                time.sleep(_END_SEEN_S)
+                time.sleep(END_SEEN_S)
                 if self._run(instance_id) != run:
                     return
             except (httpx.TransportError, httpx.InvalidURL, Unreachable, ApiError) as error:

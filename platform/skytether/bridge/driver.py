@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 _TURN = 8
 """Batches (of up to 64 kB) taken from the socket before something is sent again, and bursts sent before the socket is
 looked at again: what the peer says of those before decides how the next are sent."""
-_OTHER_PORT_S = 5.0
+OTHER_PORT_S = 5.0
 """Seconds of silence after which a path of the robot's end goes on from another port. A router, firewall or load
 balancer that has noted the old one as leading nowhere keeps to that for as long as packets come from it."""
 
@@ -65,7 +65,7 @@ class Driver:
         if 0 in self._sockets:
             self._loop.add_reader(self._sockets[0], self._on_readable, 0)
         if not self._service:
-            self._silence_timer = self._loop.call_later(_OTHER_PORT_S, self._on_silence)
+            self._silence_timer = self._loop.call_later(OTHER_PORT_S, self._on_silence)
         self._advance()
 
     def open_path(self, path: int, sock: DatagramSocket, cost: int, peer: Address | None) -> None:
@@ -130,11 +130,11 @@ class Driver:
     def _on_silence(self) -> None:
         """Have the paths on which nobody answers go on from other ports."""
         now = time.monotonic()
-        due = now + _OTHER_PORT_S
+        due = now + OTHER_PORT_S
         for path in list(self._sockets):
             since = max(self._session.heard_at(path), self._ports_since.get(path, -math.inf))
-            if now < since + _OTHER_PORT_S:
-                due = min(due, since + _OTHER_PORT_S)
+            if now < since + OTHER_PORT_S:
+                due = min(due, since + OTHER_PORT_S)
             elif (other := self._sockets[path].another()) is not None:
                 self._close(path)
                 self._sockets[path] = other

@@ -14,7 +14,7 @@ import threading
 from collections import deque
 from contextlib import suppress
 
-_SO_PASSRIGHTS = 83
+SO_PASSRIGHTS = 83
 """Linux, asm-generic/socket.h; Python does not name it."""
 _MOST_SENT = 253
 """Of one message, as the kernel has it (SCM_MAX_FD)."""
@@ -32,7 +32,7 @@ def refuse(own: socket.socket) -> bool:
         Whether it does.
     """
     try:
-        own.setsockopt(socket.SOL_SOCKET, _SO_PASSRIGHTS, 0)
+        own.setsockopt(socket.SOL_SOCKET, SO_PASSRIGHTS, 0)
     except OSError:
         return False
     return True
@@ -84,7 +84,7 @@ class Closer:
             self._waiting.popleft()
 
 
-_CLOSER = Closer()
+CLOSER = Closer()
 
 
 def receive(source: socket.socket, largest: int, room: int = 0) -> tuple[bytes, Ancillary, object]:
@@ -108,7 +108,7 @@ def receive(source: socket.socket, largest: int, room: int = 0) -> tuple[bytes, 
     try:
         data, ancillary, _, sender = source.recvmsg(largest, room)
     finally:
-        _CLOSER.close(held)  # after the message has let go of them, so that this is the last close
+        CLOSER.close(held)  # after the message has let go of them, so that this is the last close
     return data, ancillary, sender
 
 
@@ -120,7 +120,7 @@ def _hold(source: socket.socket, room: int) -> list[int]:
     """
     if not source.recvmsg(1, room, socket.MSG_PEEK)[2] & socket.MSG_CTRUNC:
         return []
-    if not _CLOSER.has_room():
+    if not CLOSER.has_room():
         raise BlockingIOError
     room += socket.CMSG_SPACE(_MOST_SENT * _INT.size)
     _, ancillary, flags, _ = source.recvmsg(1, room, socket.MSG_PEEK | socket.MSG_CMSG_CLOEXEC)
@@ -131,6 +131,6 @@ def _hold(source: socket.socket, room: int) -> list[int]:
         for (number,) in _INT.iter_unpack(data[: len(data) // _INT.size * _INT.size])
     ]
     if flags & socket.MSG_CTRUNC:  # this process has no room for all of them
-        _CLOSER.close(held)
+        CLOSER.close(held)
         raise BlockingIOError
     return held

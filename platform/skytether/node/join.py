@@ -27,10 +27,11 @@ from .run import NodeProgram
 from .store import NodeConfig, NodeError, NodeStore, new_key, request_for
 
 _TOKEN = re.compile(r"sky-[0-9a-f]{64}\.[0-9a-f]{64}")
-_POLL_S, _LEFT_S = 0.1, 1.0
+POLL_S, LEFT_S = 0.1, 1.0
+"""Between two looks whether a site answers, and whether one that leaves is gone."""
 _READY_S = 300.0
 """By when a site that joined has answered: a slow machine takes a minute to start a program."""
-_LOOK_S = 5.0
+LOOK_S = 5.0
 """Between two looks whether the unit comes up at all."""
 _MOST_LIST = 64 << 20
 """Bytes of a list of containers."""
@@ -245,7 +246,7 @@ def _until_there(store: NodeStore, url: str, *, by_unit: bool = False) -> Stands
     began = looked_at = time.monotonic()
     trust, last = trusting(store.authority(), store.identity), ""
     while time.monotonic() < began + _READY_S:
-        if by_unit and time.monotonic() >= looked_at + _LOOK_S:
+        if by_unit and time.monotonic() >= looked_at + LOOK_S:
             looked_at = time.monotonic()
             if why := unit.trouble():
                 last = why
@@ -260,7 +261,7 @@ def _until_there(store: NodeStore, url: str, *, by_unit: bool = False) -> Stands
             last = stands.reason or "the site is gone"
             if stands.state == "gone":
                 break
-        time.sleep(_POLL_S)
+        time.sleep(POLL_S)
     raise NodeError(
         f"the site did not answer within {time.monotonic() - began:.0f} s ({last}); nothing is left of the join, and "
         "the token is used up; `journalctl -u skytether-node` may say more"
@@ -368,7 +369,7 @@ def _leave(
                 f"{text}; nothing else takes them, perhaps: `skytether instance list` says why. They stay, and so does "
                 "the site; with --force it ends with them"
             )
-        time.sleep(_LEFT_S)
+        time.sleep(LEFT_S)
 
 
 def _ask_any(config: NodeConfig, trust: ssl.SSLContext, asked: Leave) -> Stands:

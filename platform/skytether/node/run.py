@@ -48,9 +48,9 @@ from .store import NodeError, NodeStore, new_key, renew_due, request_for
 
 log = logging.getLogger(__name__)
 
-_LOOK_S, _LOOK_AWAY_S = 5.0, 1.0
+LOOK_S, LOOK_AWAY_S = 5.0, 1.0
 """Between two looks at the engine, and whether the certificate is to be renewed; and while the engine is away."""
-_AGAIN_S, _AGAIN_MOST_S = 1.0, 30.0
+AGAIN_S, _AGAIN_MOST_S = 1.0, 30.0
 """Before another attempt to link; the wait doubles, and is by chance up to a third shorter, so that a thousand nodes of
 an orchestrator that was restarted do not come at once."""
 _REFUSED_S = 300.0
@@ -105,7 +105,7 @@ class NodeProgram:
                 self._group = group
                 self._learn(self._config.urls)
                 while self._is_joined():
-                    await asyncio.sleep(_LOOK_S)
+                    await asyncio.sleep(LOOK_S)
                 for link in self._links.values():
                     link.cancel()
             log.info("this machine is no site any more")
@@ -132,20 +132,20 @@ class NodeProgram:
                 self._store.save(self._config)
 
     async def _keep(self, url: str) -> None:
-        wait = _AGAIN_S
+        wait = AGAIN_S
         while True:
             began = time.monotonic()
             try:
                 await self._link(url)
                 self._warn_once(url, f"the link to {url} ended")
-                pause = _AGAIN_S
+                pause = AGAIN_S
             except RefusedError as error:
                 self._warn_once(url, f"{url}: {error}")
                 pause = _REFUSED_S if error.final else wait
             except NodeError as error:
                 self._warn_once(url, str(error))
                 pause = wait
-            wait = _AGAIN_S if time.monotonic() - began > _AGAIN_MOST_S else min(_AGAIN_MOST_S, 2 * wait)
+            wait = AGAIN_S if time.monotonic() - began > _AGAIN_MOST_S else min(_AGAIN_MOST_S, 2 * wait)
             await asyncio.sleep(pause * random.uniform(2 / 3, 1))
 
     def _warn_once(self, url: str, text: str) -> None:
@@ -264,7 +264,7 @@ class NodeProgram:
                 with contextlib.suppress(NodeError):  # it is good still, and tried again
                     await self._renew(url)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_LOOK_AWAY_S if away else _LOOK_S):
+                async with asyncio.timeout(LOOK_AWAY_S if away else LOOK_S):
                     await doubt.wait()
 
     async def _engine_away(self) -> str:

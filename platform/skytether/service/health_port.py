@@ -30,7 +30,7 @@ from skytether.api.usage import write_usage
 from .container_usage import container_usage
 from .health import check
 
-_TIMEOUT_S = 2.0
+TIMEOUT_S = 2.0
 """Of one connection, whatever comes on it."""
 _MOST_AT_ONCE = 64
 _MOST_HEAD = 16 << 10
@@ -84,7 +84,7 @@ class _Answers:
         if self._ended:
             self._cut(writer)
         try:
-            async with asyncio.timeout(_TIMEOUT_S):
+            async with asyncio.timeout(TIMEOUT_S):
                 head = await reader.readuntil(b"\r\n\r\n")
                 writer.write(self._answer(head))
                 await writer.drain()

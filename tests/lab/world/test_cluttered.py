@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from skytether.lab.trail import Pose
-from skytether.lab.world import cluttered
 from skytether.lab.world.cluttered import NoFieldError, field, shortest_way, way_length
 from skytether.lab.world.plan import Box, Cylinder, Plan
 from skytether.lab.world.robot import RobotParams
@@ -47,12 +46,11 @@ def test_a_field_has_a_free_way_that_is_not_straight() -> None:
     assert not any(pole.mapped for pole in made.plan.cylinders)
 
 
-def test_wrong_numbers_and_robots_that_fit_nowhere_are_refused(monkeypatch) -> None:
+def test_wrong_numbers_and_robots_that_fit_nowhere_are_refused() -> None:
     with pytest.raises(ValueError, match="0 to 49, not 50"):
         field(50)
-    monkeypatch.setattr(cluttered, "_TRIES", 3)
     with pytest.raises(NoFieldError, match=r"radius was found in 3 tries"):
-        field(0, clearance=2.3)
+        field(0, clearance=2.3, tries=3)
 
 
 @pytest.mark.slow

@@ -157,7 +157,7 @@ def test_tokens_that_a_robot_makes_and_uses_again_and_again_cost_no_memory(
     """Fifteen a second were 250 MB a day: when each was used last was never forgotten."""
     now = [1000.0]
     monkeypatch.setattr(accesses, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(accesses, "_MOST_RECENT", 5)
+    monkeypatch.setattr(accesses, "MOST_RECENT", 5)
     access = Access(store, Secrets(tmp_path), lambda: now[0], RateLimiter(100, 100, lambda: 0.0))
     _, token = access.register("walker", ("*",), ttl_s=None)
     sizes = []

@@ -388,7 +388,7 @@ def test_the_echo_of_a_machine_that_joins_answers_the_orchestrator_or_it_is_told
         port = free.getsockname()[1]
     assert nodes.join(echo=port).stands.echo is True
     nodes.engine("other")
-    monkeypatch.setattr(node_echo, "_ASK_S", 0.05)  # nobody is there who could answer
+    monkeypatch.setattr(node_echo, "ASK_S", 0.05)  # nobody is there who could answer
     # Robots would be told an address at which nobody passes on what comes for this machine.
     assert (
         join.join(nodes.options(nodes.invite("other"), "other", echo=port, advertise="192.0.2.1")).stands.echo is False
@@ -426,7 +426,7 @@ class MadeUpSystemd:
         monkeypatch.setattr(unit, "install", self.install)
         monkeypatch.setattr(unit, "remove", self.stack.close)
         monkeypatch.setattr(unit, "trouble", lambda: self.trouble)
-        monkeypatch.setattr(join, "_LOOK_S", 0.05)
+        monkeypatch.setattr(join, "LOOK_S", 0.05)
 
     def install(self, text: str) -> None:
         self.texts.append(text)

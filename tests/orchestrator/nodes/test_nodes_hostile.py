@@ -150,7 +150,7 @@ def test_a_node_that_does_not_read_what_it_is_told_is_cut_off(
     nodes: NodeScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nodes.join()
-    monkeypatch.setattr(ways, "_MOST_UNREAD", -1)
+    monkeypatch.setattr(ways, "MOST_UNREAD", -1)
     with connection(nodes, context_of(nodes.store())) as link:
         link.sendall(line_of(Link()) + line_of(Said(engine="")))
         until(lambda: "it does not read what it is told" in nodes.operator.get_site("edge").reason)
@@ -158,8 +158,8 @@ def test_a_node_that_does_not_read_what_it_is_told_is_cut_off(
 
 def test_what_an_engine_says_beyond_measure_waits(nodes: NodeScene, monkeypatch: pytest.MonkeyPatch) -> None:
     """A node's machine has the bandwidth, and the orchestrator's loop has all nodes to serve."""
-    monkeypatch.setattr(ways, "_BYTES_PER_S", 1)
-    monkeypatch.setattr(ways, "_BYTES", 1 << 16)
+    monkeypatch.setattr(ways, "BYTES_PER_S", 1)
+    monkeypatch.setattr(ways, "BYTES", 1 << 16)
     nodes.shut()
     nodes.open()
     nodes.join()
@@ -239,7 +239,7 @@ def test_a_node_whose_name_takes_for_ever_to_resolve_keeps_nobody_waiting(
     nodes.join("edge")
     ended = threading.Event()
     monkeypatch.setattr(node_echo, "echo_answers", lambda *_: ended.wait(30))
-    monkeypatch.setattr(node_echo, "_PATIENCE_S", 0.05)
+    monkeypatch.setattr(node_echo, "PATIENCE_S", 0.05)
     try:
         nodes.join("other", echo=free_port())
         hostile = context_of(nodes.store("other"))

@@ -366,7 +366,7 @@ def test_services_read_nothing_of_where_the_orchestrator_was_started_but_what_is
 
 
 def test_the_outermost_folder_that_others_may_not_pass_is_covered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(confinement, "_COVER", ("/run",))
+    monkeypatch.setattr(confinement, "COVERED", ("/run",))
     with tempfile.TemporaryDirectory(dir="/var/tmp") as root:  # above pytest's own is one that others may not pass
         for path, mode in (("", 0o755), ("a", 0o755), ("a/b", 0o700), ("a/b/c", 0o700), ("d", 0o755)):
             os.makedirs(f"{root}/{path}", exist_ok=True)

@@ -62,7 +62,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Script:
 
 
 def test_it_goes_over_http_until_the_run_ends(served: Any, script: Script, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client, "_END_SEEN_S", 0.2)
+    monkeypatch.setattr(client, "END_SEEN_S", 0.2)
     runtime = served.site()
     robot = served.robot()
     made = robot.create_instance(InstanceCreate(robot="walker", service="toy"))

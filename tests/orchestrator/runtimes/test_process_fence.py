@@ -209,7 +209,7 @@ def test_a_site_that_cannot_be_written_is_nobodys_fault(tmp_path: Path) -> None:
 def test_a_process_that_cannot_be_ended_is_told_and_holds_up_nobody(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(runs, "_END_S", 0.02)
+    monkeypatch.setattr(runs, "END_S", 0.02)
     with subprocess.Popen(["sleep", "60"]) as child:
         stat = ProcessStat.read(child.pid)
         assert stat is not None

@@ -3,7 +3,6 @@ import threading
 
 import pytest
 
-from skytether.robot.agent import log_queue
 from skytether.robot.agent.log_queue import LogQueue
 
 LOG = logging.getLogger("skytether.robot.test")
@@ -83,10 +82,9 @@ def test_a_handler_that_fails_does_not_end_the_log(reader, monkeypatch):
     assert reader.lines == ["two"]
 
 
-def test_who_never_reads_is_left_behind(reader, monkeypatch):
-    monkeypatch.setattr(log_queue, "_DRAIN_S", 0.1)
+def test_who_never_reads_is_left_behind(reader):
     before = threading.enumerate()
-    lines = LogQueue(2)
+    lines = LogQueue(2, drain_s=0.1)
     lines.use()
     for _ in range(10):
         LOG.warning("unread")

@@ -71,7 +71,7 @@ def test_only_the_masters_machine_ends_a_node_or_changes_its_publishers() -> Non
 
 
 def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slave, "_MOST_OF_ONE", 16)
+    monkeypatch.setattr(slave, "MOST_OF_ONE", 16)
     server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
     threads = threading.active_count()
     held = []
@@ -97,7 +97,7 @@ def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out(m
 
 
 def test_all_together_have_no_more_than_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slave, "_MOST", 3)
+    monkeypatch.setattr(slave, "MOST_CONNECTIONS", 3)
     server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
     try:
         held = [

@@ -84,7 +84,7 @@ def test_a_message_has_the_node_s_logger_the_level_and_a_bound(node, log):
 
 
 def test_the_level_follows_that_of_the_node_s_logger_and_is_as_before_in_the_end(node, log, monkeypatch):
-    monkeypatch.setattr(console, "_LOOK_S", 0.02)
+    monkeypatch.setattr(console, "LOOK_S", 0.02)
     node.joined.set()
     with Console(node, "/one/skytether", ROOT):
         log.debug("not this")

@@ -27,7 +27,6 @@ _CONFIG = Config(rate_bps=1e9)
 _LEARN_S = 2.0
 """Of made-up time, for the handshake and the search for the largest packet."""
 _REST_S = 0.05
-_PATIENCE_S = 10.0
 _NONCE = bytes(12)
 
 
@@ -125,7 +124,10 @@ class _Pair:
 
 
 def bench_authentication(
-    n: int, sizes: Sequence[int] = SIZES, clock: Callable[[], float] = time.thread_time
+    n: int,
+    sizes: Sequence[int] = SIZES,
+    clock: Callable[[], float] = time.thread_time,
+    patience_s: float = 10.0,
 ) -> list[AuthenticationRow]:
     """Send messages of each size, one after the other.
 
@@ -133,16 +135,17 @@ def bench_authentication(
         n: Messages of each size.
         sizes: Bytes of a message.
         clock: Processor time of this thread [s].
+        patience_s: Made-up seconds that a message gets to arrive.
 
     Raises:
         BenchError: A message did not arrive.
     """
     pair = _Pair(clock)
     pair.run(_LEARN_S)
-    return [_measure(pair, size, n, clock) for size in sizes]
+    return [_measure(pair, size, n, clock, patience_s) for size in sizes]
 
 
-def _measure(pair: _Pair, size: int, n: int, clock: Callable[[], float]) -> AuthenticationRow:
+def _measure(pair: _Pair, size: int, n: int, clock: Callable[[], float], patience_s: float) -> AuthenticationRow:
     payload = Random(size).randbytes(size)
     again = _Again(clock)
     found, packets = [], 0
@@ -152,7 +155,7 @@ def _measure(pair: _Pair, size: int, n: int, clock: Callable[[], float]) -> Auth
         pair.spent = dict.fromkeys(Role, 0.0)
         pair.arrived = 0
         pair.publish(payload)
-        pair.run(_PATIENCE_S, lambda: pair.arrived > 0)
+        pair.run(patience_s, lambda: pair.arrived > 0)
         if not pair.arrived:
             raise BenchError(f"message {number} of {size} bytes did not arrive")
         batches = [one for one in pair.sent if one[0][0] in (DATA, SHARD)]

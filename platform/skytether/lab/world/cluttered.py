@@ -37,8 +37,8 @@ _RADIUS = (0.075, 0.14)
 """Of a cylinder, m."""
 _GRID = 0.1
 """Of the search for a way, m."""
-_TRIES = 200
-"""Fields that are drawn for one world before the search is given up. About one in three serves."""
+TRIES = 200
+"""Fields that are drawn for one world before the search is given up."""
 _STEPS = [(x, y, math.hypot(x, y)) for x in range(-2, 3) for y in range(-2, 3) if math.gcd(x, y) == 1]
 """16 directions: the length found on the grid is at most 2.8 % above the true one, before it is straightened."""
 _THICKNESS = 0.1
@@ -71,7 +71,9 @@ class Field:
     clearance: float
 
 
-def field(number: int, *, seed: int = 1, clearance: float | None = None, worlds: int = WORLDS) -> Field:
+def field(
+    number: int, *, seed: int = 1, clearance: float | None = None, worlds: int = WORLDS, tries: int = TRIES
+) -> Field:
     """Make one world; the same numbers give the same world.
 
     Args:
@@ -79,6 +81,7 @@ def field(number: int, *, seed: int = 1, clearance: float | None = None, worlds:
         seed: Of the set.
         clearance: Radius that must fit through [m]; None: that of the robot's circumscribed circle.
         worlds: In the set.
+        tries: Fields that are drawn before the search is given up; one in three serves.
 
     Raises:
         ValueError: There is no such number.
@@ -89,7 +92,7 @@ def field(number: int, *, seed: int = 1, clearance: float | None = None, worlds:
     radius = RobotParams().circumscribed if clearance is None else clearance
     random = np.random.default_rng([seed, number])
     fill = float(np.interp(number, (0, max(worlds - 1, 1)), _FILL))
-    for _ in range(_TRIES):
+    for _ in range(tries):
         plan = _plan(f"field-{seed}-{number}", _cylinders(fill, random))
         # A field that can be driven straight through shows nothing.
         if _are_free(plan, np.array([plan.starts[0][:2]]), np.array(plan.goals[0][:2]), radius)[0]:
@@ -98,7 +101,7 @@ def field(number: int, *, seed: int = 1, clearance: float | None = None, worlds:
         if way is not None:
             return Field(number, seed, plan, way, way_length(way), radius)
     raise NoFieldError(
-        f"no field with a way for a robot of {radius:.2f} m radius was found in {_TRIES} tries; take a smaller"
+        f"no field with a way for a robot of {radius:.2f} m radius was found in {tries} tries; take a smaller"
     )
 
 

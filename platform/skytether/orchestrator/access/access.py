@@ -45,7 +45,8 @@ _RECENT = 10.0
 """Seconds for which a token that was good is good enough to measure a round trip, and to read a renewal."""
 _UNKNOWN = 2.0
 """Seconds for which a token that nobody knew is refused without another look into the database."""
-_MOST_RECENT = 4096
+MOST_RECENT = 4096
+"""Tokens that are remembered so, of those that were good and of those that nobody knew."""
 _NO_TOKEN = "a token is needed: send `Authorization: Bearer TOKEN`"  # noqa: S105 - none
 _PER_REQUEST = 8192
 """Bytes of a body that count as another request: a renewal with a report on twenty topics."""
@@ -351,7 +352,7 @@ def _keep(cache: OrderedDict[str, tuple[Any, float]], digest: str, what: Any) ->
     """As the newest; the oldest goes."""
     cache.pop(digest, None)
     cache[digest] = what, time.monotonic()
-    while len(cache) > _MOST_RECENT:
+    while len(cache) > MOST_RECENT:
         with contextlib.suppress(KeyError):  # another thread did
             cache.popitem(last=False)
 

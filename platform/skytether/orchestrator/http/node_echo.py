@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 from skytether.bridge.echo import EchoClient
 
-_ASK_S, _TRIES = 0.5, 3
-ECHOES, _PATIENCE_S = 8, 3.0
+ASK_S, _TRIES = 0.5, 3
+"""For how long an echo is waited for, and how often it is asked."""
+ECHOES, PATIENCE_S = 8, 3.0
 """Looks for echoes at once, of all nodes, and how long a node waits for one."""
 
 
@@ -46,7 +47,7 @@ class EchoLooks:
         self._under_way += 1
         threading.Thread(target=probe, name="node-echo", daemon=True).start()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(_PATIENCE_S):
+            async with asyncio.timeout(PATIENCE_S):
                 return await answered
         return None
 
@@ -55,6 +56,6 @@ def echo_answers(host: str, port: int) -> bool:
     """Whether a UDP echo answers."""
     try:
         with EchoClient(host, port) as client:
-            return any(client.ask(_ASK_S) is not None for _ in range(_TRIES))
+            return any(client.ask(ASK_S) is not None for _ in range(_TRIES))
     except (OSError, UnicodeError):  # UnicodeError: it is no name that could be looked up
         return False

@@ -35,10 +35,10 @@ _LINES_PER_S, _LINES = 50.0, 2 * MOST_WAYS
 """What a node may say on its link, and at once: all its ways fail at once where its machine has no room for them."""
 _TURNS_PER_S, _TURNS = 0.5, 10
 """Of these, those by which its engine goes or comes: with each the socket here goes or comes."""
-_BYTES_PER_S, _BYTES = 8 << 20, 32 << 20
+BYTES_PER_S, BYTES = 8 << 20, 32 << 20
 """What its engine may say, and at once: a thousand containers tell 3 MiB a second, and all is read in one process,
 where robots' requests are served, too. Beyond that it waits, and so does nobody else."""
-_MOST_UNREAD = 1 << 16
+MOST_UNREAD = 1 << 16
 """Bytes that a node has not taken of what it was told on its link, some thousand lines."""
 
 
@@ -85,7 +85,7 @@ class Ways:
         """Of all nodes, also of links that have ended."""
         self._lines = RateLimiter(_LINES_PER_S, _LINES, time.monotonic)
         self._turns = RateLimiter(_TURNS_PER_S, _TURNS, time.monotonic)
-        self._bytes = RateLimiter(_BYTES_PER_S, _BYTES, time.monotonic)
+        self._bytes = RateLimiter(BYTES_PER_S, BYTES, time.monotonic)
 
     def linked(self) -> dict[str, str]:
         """Those that are, each with the address that it is seen as."""
@@ -131,7 +131,7 @@ class Ways:
                 if said.engine is not None:
                     await _until_free(self._turns, node.name)
                 self._on_message(node, said)
-                if node.writer.transport.get_write_buffer_size() > _MOST_UNREAD:
+                if node.writer.transport.get_write_buffer_size() > MOST_UNREAD:
                     return "it does not read what it is told"
         except asyncio.IncompleteReadError:
             return "the connection ended"

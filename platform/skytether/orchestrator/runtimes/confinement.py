@@ -30,7 +30,7 @@ _READ = (
 )
 """Not all of /etc, which holds other programs' secrets, nor /var and /home."""
 _WRITE = ("/dev/null", "/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
-_COVER = ("/tmp", "/var/tmp", "/dev/shm", "/run")  # noqa: S108
+COVERED = ("/tmp", "/var/tmp", "/dev/shm", "/run")  # noqa: S108
 """Where other programs leave files and sockets for everybody; the engine's socket is in /run."""
 _PROBE_S = 30
 
@@ -153,7 +153,7 @@ def launch_file(path: str, reachable: Sequence[str], closed: Sequence[Path]) -> 
 
 def covers(paths: Sequence[str]) -> list[str]:
     """Folders to cover: those of other programs, and the outermost above each path that others may not pass through."""
-    found = [folder for folder in _COVER if os.path.isdir(folder) and not os.path.islink(folder)]
+    found = [folder for folder in COVERED if os.path.isdir(folder) and not os.path.islink(folder)]
     for path in paths:
         if any(os.path.realpath(path).startswith(f"{folder}/") for folder in found):
             continue

@@ -36,7 +36,7 @@ _PASSES = 20
 """Looks at a session that is being ended: whoever forks meanwhile is in the next one."""
 _WHOLE = 1.0
 """Seconds between two looks at all notes, where no folder came or went."""
-_END_S = 5.0
+END_S = 5.0
 """Seconds that a killed process gets to be gone."""
 
 Stamp = tuple[int, int, int]
@@ -155,7 +155,7 @@ class Run:
             RuntimeFailure: It does not go, as one that waits for a broken disk.
         """
         self.kill()
-        deadline = time.monotonic() + _END_S
+        deadline = time.monotonic() + END_S
         while self.lives:
             if time.monotonic() > deadline:
                 pid = self.process.pid if self.process else 0
@@ -163,7 +163,7 @@ class Run:
             time.sleep(0.002)
         if self.child is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.child.wait(_END_S)
+                self.child.wait(END_S)
 
 
 class Runs:

@@ -14,7 +14,7 @@ from logging.handlers import QueueHandler
 
 MOST_LINES = 1000
 """Lines that wait at most, some hundred KiB; further ones are dropped and counted. An agent says few a minute."""
-_DRAIN_S = 1.0
+DRAIN_S = 1.0
 """At the end, for lines that still wait: a log that is not read by then is not read."""
 _NAME = "skytether"
 """All loggers of the package are below this one."""
@@ -26,8 +26,9 @@ class LogQueue:
     Handlers that are attached to a single logger further below are left as they are: these may wait.
     """
 
-    def __init__(self, most: int = MOST_LINES) -> None:
+    def __init__(self, most: int = MOST_LINES, drain_s: float = DRAIN_S) -> None:
         self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(most)
+        self._drain_s = drain_s
         self._logger = logging.getLogger(_NAME)
         self._lock = threading.Lock()
         self._users = 0
@@ -67,9 +68,9 @@ class LogQueue:
             thread, self._thread = self._thread, None
             leave = self._leave
         with suppress(queue.Full):  # nobody has read for long: the thread is left behind, it ends with the program
-            self._lines.put(None, timeout=_DRAIN_S)
+            self._lines.put(None, timeout=self._drain_s)
         if thread is not None:
-            thread.join(_DRAIN_S)
+            thread.join(self._drain_s)
         leave.set()
 
     def _run(self, handlers: list[logging.Handler], propagate: bool, leave: threading.Event) -> None:

@@ -21,7 +21,7 @@ FROM_MASTER = ("shutdown", "publisherUpdate")
 """What ends the node, or takes its topics to other publishers: only the machine of the master may, and this one."""
 _RESOLVED_S = 10.0
 """So long a name's addresses are good: others may make us look it up."""
-_MOST, _MOST_OF_ONE = 256, 128
+MOST_CONNECTIONS, MOST_OF_ONE = 256, 128
 """Connections at a time, each of which has a thread: in all, and from one address, so that a stranger's do not keep the
 master out. All nodes of a machine may ask at once, when a topic that they want comes; each is answered and closed."""
 _IDLE_S = 30.0
@@ -107,7 +107,7 @@ class _Handler(SimpleXMLRPCRequestHandler):
 class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     daemon_threads = True
     block_on_close = False
-    request_queue_size = _MOST
+    request_queue_size = MOST_CONNECTIONS
     """Who finds no room in it comes again after a second, by its kernel's timer."""
     trusts: Callable[[str], bool]
 
@@ -120,7 +120,7 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
         """In a thread of its own; who comes on top of those that there may be is closed."""
         asker = client_address[0]
         with self._lock:
-            full = self._open.total() >= _MOST or self._open[asker] >= _MOST_OF_ONE
+            full = self._open.total() >= MOST_CONNECTIONS or self._open[asker] >= MOST_OF_ONE
             if not full:
                 self._open[asker] += 1
         if full:

@@ -22,7 +22,7 @@ KEPT = 100
 """Messages that wait for the graph, and that a newcomer gets."""
 MAX_TEXT = 8192
 """Characters of a message."""
-_LOOK_S = 0.5
+LOOK_S = 0.5
 """Between two looks at the level of our node's logger, and whether the graph is joined."""
 _LEVELS = (logging.DEBUG, logging.INFO, logging.WARNING, logging.ERROR, logging.CRITICAL)
 """ROS 2 has the same numbers."""
@@ -88,7 +88,7 @@ class Console:
     def _run(self) -> None:
         """Thread that publishes, and follows the level."""
         while not self._ended:
-            self._changed.wait(_LOOK_S)
+            self._changed.wait(LOOK_S)
             self._changed.clear()
             if self._node.log_level != self._level:
                 self._level = self._node.log_level

@@ -31,7 +31,7 @@ Answer = Callable[[bytes], Iterator[bytes]]
 @pytest.fixture
 def engine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Client]]:
     """A client of an engine that answers each request with these pieces, and is silent then."""
-    monkeypatch.setattr(clients, "_MOST", 1 << 20)
+    monkeypatch.setattr(clients, "MOST_BYTES", 1 << 20)
     opened: list[socket.socket] = []
     made: list[Client] = []
     monkeypatch.chdir(tmp_path)
@@ -175,7 +175,7 @@ def test_events_come_one_by_one_and_their_silence_has_an_end(engine: Callable[..
 def test_a_message_that_never_ends_costs_no_memory(
     engine: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(clients, "_MOST_MESSAGE", 1 << 18)
+    monkeypatch.setattr(clients, "MOST_MESSAGE", 1 << 18)
 
     def answer(_: bytes) -> Iterator[bytes]:
         yield CHUNKED
@@ -243,7 +243,7 @@ def test_of_a_refusal_less_is_read_than_of_an_answer(
     engine: Callable[..., Client], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It need not say which characters it is of, and to guess that takes seconds for 32 MiB."""
-    monkeypatch.setattr(clients, "_MOST_REFUSAL", 1000)
+    monkeypatch.setattr(clients, "MOST_REFUSAL", 1000)
     with pytest.raises(requests.ConnectionError, match="an answer of more than"):
         engine(whole(bytes(range(256)) * 8, b"500 No")).info()
 

@@ -159,7 +159,7 @@ def test_what_a_machine_lacks_another_site_has(house: House) -> None:
 def test_a_site_without_its_guard_says_so_and_starts_what_waits_when_it_is_there(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runtime, "_AGAIN_S", 0.2)
+    monkeypatch.setattr(runtime, "AGAIN_S", 0.2)
     guard, late = house.docker.images.name("guard"), house.docker.images.name("late-guard")
     new = {"owner": f"{house.docker.owner}-late", "network": f"{house.docker.network}-late", "guard_image": late}
     options = house.docker.options(**new, devices=["/dev/null"])

@@ -177,7 +177,7 @@ def test_what_a_late_leader_has_begun_beside_a_later_run_is_ended(
 def test_nothing_is_left_of_a_container_that_somebody_removed(
     docker_site: DockerSite, runtimes: tuple[DockerRuntime, DockerRuntime], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_SWEEP_S", 0.0)
+    monkeypatch.setattr(module, "SWEEP_S", 0.0)
     leader = runtimes[1]
     image = f"{docker_site.images.prefix}declares:1"
     recipe = f"FROM {docker_site.images.toy}\nVOLUME /more /run/skytether /tmp\n"
@@ -245,7 +245,7 @@ os._exit(9)
 def test_an_orchestrator_that_is_killed_between_any_two_calls_leaves_nothing_that_is_not_found(
     docker_site: DockerSite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_SWEEP_S", 0.0)
+    monkeypatch.setattr(module, "SWEEP_S", 0.0)
     calls = 30
     here = str(Path(__file__).parents[3] / "support")
     given = here, tmp_path, docker_site.images.prefix, docker_site.network, docker_site.owner, calls

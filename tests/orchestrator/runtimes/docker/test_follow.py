@@ -173,7 +173,7 @@ def test_what_a_container_does_all_the_time_keeps_nobody_from_seeing_the_others(
         return found
 
     monkeypatch.setattr(engine, "inspect_container", inspected)
-    monkeypatch.setattr(follow, "_AT_WILL_S", 0.2)
+    monkeypatch.setattr(follow, "AT_WILL_S", 0.2)
     engine.ready.set()
     follower.start()
     follower.seen(PATIENCE)
@@ -199,7 +199,7 @@ def test_all_are_listed_now_and_then_though_events_never_cease(
     engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An engine drops events that are not taken soon, and a stream that is never silent was never begun anew."""
-    monkeypatch.setattr(follow, "_LIST_S", 0.1)
+    monkeypatch.setattr(follow, "LIST_S", 0.1)
     engine.ready.set()
     follower.start()
     follower.seen(PATIENCE)
@@ -247,7 +247,7 @@ def test_containers_that_an_engine_makes_up_cost_no_thread_each(
 def test_an_engine_that_lists_more_than_there_can_be_is_not_believed(
     engine: StagedEngine, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(follow, "_MOST_LISTED", 39)
+    monkeypatch.setattr(follow, "MOST_LISTED", 39)
     made_up(engine, monkeypatch, 40)
     follower.start()
     with pytest.raises(RuntimeFailure, match="lists 40 containers of this site: that cannot be"):

@@ -54,7 +54,7 @@ def server() -> Iterator[OneTokenServer]:
 
 @pytest.fixture
 def opened(server: OneTokenServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
-    monkeypatch.setattr(cluster, "_RENEW_S", 0.0)
+    monkeypatch.setattr(cluster, "RENEW_S", 0.0)
     (tmp_path / "token").write_text("first")
     address = f"http://127.0.0.1:{server.server_port}"
     config = {

@@ -33,7 +33,7 @@ Answer = Callable[[], Iterator[bytes]]
 @pytest.fixture
 def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Cluster]]:
     """A cluster whose API server passes on what these pods answer, piece by piece; others are honest."""
-    monkeypatch.setattr(reports, "_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(reports, "TIMEOUT_S", 0.5)
     opened: list[socket.socket] = []
     made: list[Cluster] = []
 
@@ -176,8 +176,8 @@ def says(**document: object) -> Answer:
 def test_who_is_well_although_its_node_says_otherwise_runs_on_and_who_is_not_says_why(
     cluster: Callable[..., Cluster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(health, "_EVERY_S", 0.0)
-    monkeypatch.setattr(health, "_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(health, "EVERY_S", 0.0)
+    monkeypatch.setattr(health, "TIMEOUT_S", 0.2)
     pods: dict[str, Answer] = {
         "well": says(trouble=""),
         "hung": says(trouble="its loop has hung for 12 s"),
@@ -207,8 +207,8 @@ def test_who_is_well_although_its_node_says_otherwise_runs_on_and_who_is_not_say
 def test_where_the_api_server_is_silent_too_nothing_is_known(
     cluster: Callable[..., Cluster], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(health, "_EVERY_S", 0.0)
-    monkeypatch.setattr(health, "_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(health, "EVERY_S", 0.0)
+    monkeypatch.setattr(health, "TIMEOUT_S", 0.1)
     asked: list[str] = []
 
     def nothing(name: str) -> Iterator[bytes]:

@@ -18,14 +18,14 @@ from typing_extensions import override
 
 from ..whole_answer import hurried, original
 
-_MOST = 32 << 20
+MOST_BYTES = 32 << 20
 """Bytes of an answer: a container's whole log has 4 MiB, a list of a thousand containers some."""
 _MOST_VALUES = 500_000
 """Of a document: each takes 30 times the memory of its bytes. A list of a thousand containers has a tenth."""
-_MOST_MESSAGE = 1 << 18
+MOST_MESSAGE = 1 << 18
 """Bytes of one message of a stream. Those of use come by a stream for each container, a thousand at a time."""
 _MOST_MESSAGE_VALUES = 20_000
-_MOST_REFUSAL = 1 << 20
+MOST_REFUSAL = 1 << 20
 """Bytes of an answer that says no: whoever cannot tell its characters guesses them, which takes long."""
 _PIECE = 1 << 16
 _FRAME = struct.Struct(">4xL")
@@ -33,7 +33,7 @@ _FRAME = struct.Struct(">4xL")
 
 
 class Client(APIClient):
-    """Reads no more than `_MOST` bytes and for no longer than the call's time-out, whatever is sent; is led nowhere."""
+    """Reads no more than `MOST_BYTES` and for no longer than the call's time-out, whatever is sent; is led nowhere."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         """As the SDK's; ``timeout`` [s] of each call, and of the gaps in a stream."""
@@ -50,7 +50,7 @@ class Client(APIClient):
         patience = options.get("timeout") or self.timeout
         answer = super().send(request, **{**options, "timeout": patience, "stream": True})
         if answer.status_code >= HTTPStatus.BAD_REQUEST:
-            _read(answer, _MOST_REFUSAL)
+            _read(answer, MOST_REFUSAL)
             answer._content = _whole_characters(answer.content)  # noqa: SLF001 (as in `_read`)
         elif not options.get("stream"):
             _read(answer)
@@ -121,12 +121,12 @@ def _read(answer: requests.Response, most: int | None = None) -> None:
 
     Args:
         answer: Of which nothing was read yet.
-        most: Bytes; None: `_MOST`.
+        most: Bytes; None: `MOST_BYTES`.
 
     Raises:
         requests.RequestException: It has no end.
     """
-    most = _MOST if most is None else most
+    most = MOST_BYTES if most is None else most
     pieces, size = [], 0
     for piece in answer.iter_content(_PIECE):
         pieces.append(piece)
@@ -147,7 +147,7 @@ def _lines(answer: requests.Response) -> Iterator[bytes]:
     for piece in answer.raw.stream(_PIECE):
         *lines, rest = (rest + piece).split(b"\n")
         yield from (line for line in lines if line.strip())
-        if len(rest) > _MOST_MESSAGE:
+        if len(rest) > MOST_MESSAGE:
             answer.close()
             raise requests.ConnectionError("a message without an end")
     if rest.strip():

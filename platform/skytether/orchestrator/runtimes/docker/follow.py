@@ -42,7 +42,7 @@ _READY_S, _READY_MOST_S, _READY_SHARE = 0.02, 0.5, 0.02
 is looked at less often: a share of the time for which it has been waited for."""
 BESIDE = 64
 """Containers that are followed each by a thread of its own, beside two for each instance that is to be there."""
-_MOST_LISTED = 20_000
+MOST_LISTED = 20_000
 """Containers of a site, ended ones and those without a service included."""
 _REMEMBERED = 256
 """Containers that are gone of which it is known: a look that was begun before need not find them again."""
@@ -53,9 +53,9 @@ _TOLD = frozenset({"create", "start", "die", "pause", "unpause", "stop", "restar
 handed over one."""
 _AT_WILL = ("oom", "health_status")
 """Events that what runs in a container can bring about as often as it likes; the second comes with a colon and more."""
-_AT_WILL_S = 1.0
+AT_WILL_S = 1.0
 """Between two looks at a container because of such ones: with all of them nobody would get round to the others."""
-_LIST_S = 30.0
+LIST_S = 30.0
 """After which all are listed again, though events come all the time: an engine drops those that are not taken soon."""
 
 
@@ -284,7 +284,7 @@ class Follower:
         with self._lock:
             before = self._seen.keys() | self._helpers.keys()
         rows = api.containers(all=True, filters=self._mine)
-        if len(rows) > _MOST_LISTED:
+        if len(rows) > MOST_LISTED:
             raise RuntimeFailure(f"the engine lists {len(rows)} containers of this site: that cannot be")
         return before, rows
 
@@ -312,7 +312,7 @@ class Follower:
         return [container for container in there if listed[container] != seen.get(container)]
 
     def _read_events(self) -> None:
-        until = time.monotonic() + _LIST_S
+        until = time.monotonic() + LIST_S
         with suppress(urllib3.exceptions.HTTPError, OSError, ValueError, AttributeError):  # ended, or silent too long
             for event in self._stream or ():
                 if self._closing.is_set() or time.monotonic() > until:
@@ -332,7 +332,7 @@ class Follower:
                 self._at_will[container] = True
                 return
             self._at_will[container] = False
-        again = threading.Timer(_AT_WILL_S, self._look_again, (container,))
+        again = threading.Timer(AT_WILL_S, self._look_again, (container,))
         again.daemon = True
         again.start()
         self.inspect(container)

@@ -51,11 +51,11 @@ _HOLDS = {"userns": "user namespace", "rootless": "rootless engine", "seccomp": 
 """In words for people, what an engine says of its own security."""
 _LIMITS = {"MemoryLimit": "memory", "CpuCfsQuota": "processor time", "PidsLimit": "processes"}
 """In words for people, what an engine says that it can limit."""
-_SWEEP_S = 10.0
+SWEEP_S = 10.0
 """Seconds between two looks for volumes whose containers somebody has removed."""
 _LEAVE_S = 10.0
 """Seconds that starts under way get at the end: an engine that hangs must not hold up a restart for long."""
-_AGAIN_S = 10.0
+AGAIN_S = 10.0
 """Seconds between two attempts to make the network of a site ready that could not be."""
 
 
@@ -382,7 +382,7 @@ class DockerRuntime(Runtime):
             with self._doubting():
                 self.fence.lead(self.fence.epoch)  # anew, should somebody have removed what tells of it
         self.remove_unbegun()
-        if time.monotonic() - self._swept_at >= _SWEEP_S:
+        if time.monotonic() - self._swept_at >= SWEEP_S:
             self._swept_at = time.monotonic()
             remove_left(self.engine, self._owner)
         self.scales.begin()
@@ -392,7 +392,7 @@ class DockerRuntime(Runtime):
         starting |= any(seen.runs and not seen.ready for seen in self.follower.seen(self.options.timeout_s))
         self.namespaces.begin(resting=not starting and not self._blocked)
         trying = self._early is not None and self._early.is_alive()
-        if self._blocked and not trying and time.monotonic() - self._tried_at >= _AGAIN_S:
+        if self._blocked and not trying and time.monotonic() - self._tried_at >= AGAIN_S:
             self._begin_early()
 
     def remove_unbegun(self) -> None:

@@ -53,7 +53,7 @@ _STRANGER = 'User "system:anonymous"'
 _LACKS = re.compile(r'User ".*" cannot \S+ (resource|path)')
 _WEBHOOK = "failed calling webhook"
 """Says an API server of an admission webhook that does not answer: it refuses, and is not unwell itself."""
-_RENEW_S = 1.0
+RENEW_S = 1.0
 """Seconds between two looks for other credentials, while those that we have are refused."""
 Document = Mapping[str, Any]
 
@@ -267,7 +267,7 @@ class Cluster:
         with self._lock:
             if self._client is not refused:
                 return True  # another thread was here
-            if time.monotonic() - self._opened_at < _RENEW_S:
+            if time.monotonic() - self._opened_at < RENEW_S:
                 return False
             self._opened_at = time.monotonic()
             try:

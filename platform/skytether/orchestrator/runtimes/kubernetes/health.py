@@ -24,9 +24,9 @@ from .seen import PodState
 log = logging.getLogger(__name__)
 
 FAILS = "its health check fails"
-_EVERY_S = 0.5
+EVERY_S = 0.5
 """Seconds between two looks at all that are doubted."""
-_TIMEOUT_S = 1.0
+TIMEOUT_S = 1.0
 """Of one answer."""
 _TIMES = 3
 """Who answers nothing so often in a row is not well."""
@@ -43,7 +43,7 @@ class Health:
         """``told`` is called when something else is known than before."""
         self._cluster = cluster
         self._told = told
-        self._now_and_then = NowAndThen("kubernetes-health", _EVERY_S, clock, self._check)
+        self._now_and_then = NowAndThen("kubernetes-health", EVERY_S, clock, self._check)
         self._pace = Pace(_PER_S, 1)
         self._lock = threading.Lock()
         self._doubted: dict[str, PodState] = {}
@@ -100,7 +100,7 @@ class Health:
         for _ in range(_TIMES):
             self._pace.wait()
             try:
-                return pull_trouble(json.loads(self._cluster.small(path, MOST_BYTES, _TIMEOUT_S)), FAILS)
+                return pull_trouble(json.loads(self._cluster.small(path, MOST_BYTES, TIMEOUT_S)), FAILS)
             except (ValueError, RecursionError, RefusedError):
                 return FAILS
             except RuntimeFailure as error:

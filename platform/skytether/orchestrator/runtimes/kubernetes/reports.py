@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _EVERY_S = 3.0
 """Seconds between two looks at all of them."""
-_TIMEOUT_S = 2.0
+TIMEOUT_S = 2.0
 """Of one pod's answer."""
 _REST = 20
 """A pod is left alone for so many times as long as its answer took: it has a twentieth of the time that all share."""
@@ -92,7 +92,7 @@ class ReportReader:
     def _ask(self, pod: str) -> _Told:
         path = self._cluster.path("pods", f"{pod}:{HEALTH_PORT}/proxy/reports")
         try:
-            document = json.loads(self._cluster.small(path, MOST_BYTES, _TIMEOUT_S))
+            document = json.loads(self._cluster.small(path, MOST_BYTES, TIMEOUT_S))
             return pull_reports(document), pull_usage(document), pull_step_s(document)
         except (ValueError, RecursionError):
             return _NOTHING
