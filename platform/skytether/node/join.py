@@ -92,14 +92,14 @@ class _Steps:
         self.took_s[name] = time.monotonic() - began
 
 
-def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: None) -> Joined:
+def join(options: JoinOptions, on_finding: Callable[[Finding], object] = lambda _: None) -> Joined:
     """Make this machine a site.
 
     Nothing is changed before all checks are good, and what was changed is taken back if anything fails after that.
 
     Args:
         options: How.
-        tell: Called with what each check found.
+        on_finding: Called with what each check found.
 
     Raises:
         ChecksError: This machine cannot join as it is.
@@ -114,7 +114,7 @@ def join(options: JoinOptions, tell: Callable[[Finding], object] = lambda _: Non
         )
     path = engine_path(options.engine)
     with steps.step("checks"):
-        url, seen, engine = _check(options, pin, path, tell)
+        url, seen, engine = _check(options, pin, path, on_finding)
     trust = trusting(seen.authority)
     with steps.step("token"):
         invited = call(url, trust, Look(token=token), Invited)
@@ -182,13 +182,13 @@ def engine_path(engine: str) -> str:
 
 
 def _check(
-    options: JoinOptions, pin: str, path: str, tell: Callable[[Finding], object]
+    options: JoinOptions, pin: str, path: str, on_finding: Callable[[Finding], object]
 ) -> tuple[str, FirstAnswer, EngineInfo | None]:
     found: list[Finding] = []
 
     def note(finding: Finding) -> None:
         found.append(finding)
-        tell(finding)
+        on_finding(finding)
 
     note(checks.look_at_rights(options.folder, unit=options.unit))
     finding, engine = checks.look_at_engine(path)
@@ -301,7 +301,7 @@ def _take_back(store: NodeStore, url: str) -> None:
 
 
 def leave(
-    store: NodeStore, *, force: bool, timeout_s: float, tell: Callable[[str], object] = lambda _: None
+    store: NodeStore, *, force: bool, timeout_s: float, on_progress: Callable[[str], object] = lambda _: None
 ) -> str | None:
     """Let this machine be no site any more; what runs here is moved first.
 
@@ -309,7 +309,7 @@ def leave(
         store: Of the node.
         force: At once, whatever runs here, and also where no orchestrator answers.
         timeout_s: For what runs here to be moved.
-        tell: Called with how far it is, and with what is on this machine still.
+        on_progress: Called with how far it is, and with what is on this machine still.
 
     Returns:
         What is left to be done elsewhere; None: nothing.
@@ -322,7 +322,7 @@ def leave(
     try:
         config = store.config()
         engine = config.engine
-        _leave(config, store, force=force, timeout_s=timeout_s, tell=tell)
+        _leave(config, store, force=force, timeout_s=timeout_s, on_progress=on_progress)
     except NodeError as error:
         if not force:
             raise
@@ -330,7 +330,7 @@ def leave(
     unit.remove()
     store.clear()
     if still := _still_here(engine):
-        tell(still)
+        on_progress(still)
     return left
 
 
@@ -351,7 +351,7 @@ def _still_here(engine: str) -> str:
 
 
 def _leave(
-    config: NodeConfig, store: NodeStore, *, force: bool, timeout_s: float, tell: Callable[[str], object]
+    config: NodeConfig, store: NodeStore, *, force: bool, timeout_s: float, on_progress: Callable[[str], object]
 ) -> None:
     trust = trusting(store.authority(), store.identity)
     deadline, told = time.monotonic() + timeout_s, ""
@@ -362,7 +362,7 @@ def _leave(
         here = f"{stands.instances} instances are here still" if stands.instances else ""
         text = ": ".join(filter(None, (here, stands.reason))) or "the site goes"
         if text != told:
-            tell(text)
+            on_progress(text)
             told = text
         if time.monotonic() >= deadline:
             raise NodeError(

@@ -307,7 +307,7 @@ def test_who_is_forced_to_leave_leaves_without_an_orchestrator(nodes: NodeScene)
     assert "with --force this machine leaves without a word" in why
     assert nodes.store().exists()
     told: list[str] = []
-    left = leave(nodes.store(), force=True, timeout_s=0, tell=told.append)
+    left = leave(nodes.store(), force=True, timeout_s=0, on_progress=told.append)
     assert left is not None
     assert told == []
     assert not nodes.store().folder.exists()
@@ -323,7 +323,7 @@ def test_who_leaves_is_told_of_containers_that_are_here_still(nodes: NodeScene, 
     if not there:
         engine.stop()
     told: list[str] = []
-    leave(nodes.store(), force=True, timeout_s=0, tell=told.append)
+    leave(nodes.store(), force=True, timeout_s=0, on_progress=told.append)
     (text,) = told
     assert text.startswith("2 containers" if there else "containers that orchestrators made may be here still")
     assert f"`docker -H unix://{engine.path} rm -fv $(docker -H" in text
@@ -409,7 +409,7 @@ def test_who_leaves_waits_until_nothing_of_the_site_is_left(nodes: NodeScene, mo
             told.append(text)
             emptied.set()
 
-        assert leave(nodes.store(), force=False, timeout_s=20, tell=tell) is None
+        assert leave(nodes.store(), force=False, timeout_s=20, on_progress=tell) is None
         thread.join()
     assert told == ["what is left here is being removed"]
 

@@ -37,7 +37,7 @@ def serving_nodes(core: Orchestrator, listener: socket.socket | None) -> Iterato
     address = core.settings.state_dir / ADDRESS
     host, port = listener.getsockname()[:2]
     core.node_port = port
-    core.sites.tell_of_deletions(door.cut)
+    core.sites.subscribe_deletions(door.cut)
     with door:
         address.write_text(f"https://[{host}]:{port}\n" if ":" in host else f"https://{host}:{port}\n")
         try:

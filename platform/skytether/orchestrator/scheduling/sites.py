@@ -51,7 +51,7 @@ class Sites:
         self._timing = timing
         self._lock = threading.Lock()
         self._sites: dict[str, Site] = {}
-        self._told_of_deletions: list[Callable[[str], object]] = []
+        self._deletion_listeners: list[Callable[[str], object]] = []
 
     def start(self, step: Step, local: bool = True, declared: Iterable[SiteCreate] = ()) -> None:
         """Open every site of the store, and give them a moment to answer.
@@ -223,12 +223,12 @@ class Sites:
         except RuntimeFailure as error:
             log.warning("site %s was deleted, but what it left there stays: %s", name, error)
         site.runtime.close()
-        for tell in self._told_of_deletions:
-            tell(name)
+        for notify in self._deletion_listeners:
+            notify(name)
 
-    def tell_of_deletions(self, tell: Callable[[str], object]) -> None:
-        """Have ``tell`` called with the name of each site of which nothing is left here."""
-        self._told_of_deletions.append(tell)
+    def subscribe_deletions(self, notify: Callable[[str], object]) -> None:
+        """Have ``notify`` called with the name of each site of which nothing is left here."""
+        self._deletion_listeners.append(notify)
 
     def drain(self, name: str) -> bool:
         """Let a site take no more instances, and delete it as soon as none is there; whether it is gone by now.

@@ -125,7 +125,7 @@ def _watch(
     ended: threading.Event,
     seconds: float | None,
     gate: OwnGate | FoundGate | None,
-    tell: Callable[[AgentStatus], object],
+    on_status: Callable[[AgentStatus], object],
 ) -> None:
     """Say what changes, until the end.
 
@@ -134,14 +134,14 @@ def _watch(
         ended: Somebody wants the end.
         seconds: Until the end; None: for ever.
         gate: Before the wheels.
-        tell: Told often how the agent is.
+        on_status: Told often how the agent is.
     """
     gc.freeze()  # all that is loaded by now stays: looking through it for garbage takes ticks of the control loop
     begin = time.monotonic()
     before = ""
     while seconds is None or time.monotonic() - begin < seconds:
         found = status()
-        tell(found)
+        on_status(found)
         now = _sentence(found)
         if now != before:
             console.print(now, markup=False, soft_wrap=True)

@@ -231,7 +231,10 @@ def leave_node(
         fail(f"this machine has not joined, as far as {store.folder} says")
     try:
         left = leave(
-            store, force=force, timeout_s=timeout_s, tell=lambda text: console.print(text, markup=False, soft_wrap=True)
+            store,
+            force=force,
+            timeout_s=timeout_s,
+            on_progress=lambda text: console.print(text, markup=False, soft_wrap=True),
         )
     except NodeError as error:
         fail(str(error))

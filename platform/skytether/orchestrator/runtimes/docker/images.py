@@ -76,7 +76,12 @@ def check_credentials(path: str) -> None:
 
 
 def ensure_image(
-    engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None], *, by_digest: bool = False
+    engine: Engine,
+    options: DockerOptions,
+    image: str,
+    on_progress: Callable[[PullProgress], None],
+    *,
+    by_digest: bool = False,
 ) -> str:
     """The id of an image that is on the engine, after a pull if need be.
 
@@ -84,21 +89,21 @@ def ensure_image(
         engine: Where.
         options: The site's: when to pull, and with which credentials.
         image: As the manifest names it.
-        tell: Called with each step of a pull.
+        on_progress: Called with each step of a pull.
         by_digest: Pull it only if its name holds its digest, whatever the name.
 
     Raises:
         EngineGoneError: The engine does not answer.
         RuntimeFailure: The image is missing and cannot be pulled, or nobody has signed it who must have.
     """
-    found = _on_the_engine(engine, options, image, tell, by_digest=by_digest)
+    found = _on_the_engine(engine, options, image, on_progress, by_digest=by_digest)
     if options.signatures is not None:
         check(image, found, options.signers, options.signatures)
     return found
 
 
 def _on_the_engine(
-    engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None], *, by_digest: bool
+    engine: Engine, options: DockerOptions, image: str, on_progress: Callable[[PullProgress], None], *, by_digest: bool
 ) -> str:
     may_pull = "@sha256:" in image if by_digest else is_pulled(image)
     if options.pull != "always" or not may_pull:
@@ -112,7 +117,7 @@ def _on_the_engine(
             )
         if options.pull == "never":
             raise RuntimeFailure(f"image '{image}' is not on the engine, and the site's option 'pull' is never")
-    _pull(engine, options, image, tell)
+    _pull(engine, options, image, on_progress)
     found = _find(engine, image)
     if found is None:
         raise RuntimeFailure(f"image '{image}' was pulled, but is not on the engine")
@@ -127,17 +132,17 @@ def _find(engine: Engine, image: str) -> str | None:
             return None
 
 
-def _pull(engine: Engine, options: DockerOptions, image: str, tell: Callable[[PullProgress], None]) -> None:
+def _pull(engine: Engine, options: DockerOptions, image: str, on_progress: Callable[[PullProgress], None]) -> None:
     trouble = ""
     meter = PullMeter(image)
-    tell(meter.after({}))
+    on_progress(meter.after({}))
     with engine.asked():
         try:
             api = engine.api(_PULL_SILENCE_S)
             pinned = "@" in image or ":" in image.rpartition("/")[2]
             name = image if pinned else f"{image}:latest"  # or the engine would fetch every tag there is
             for message in api.pull(name, stream=True, decode=True, auth_config=_credentials(options, image)):
-                tell(meter.after(message))
+                on_progress(meter.after(message))
                 trouble = str(message["error"]) if "error" in message else trouble
         except APIError as error:
             trouble = explain(error)
