@@ -22,7 +22,7 @@ class LogThrottle:
         self._quiet_s = quiet_s
         self._seen: dict[str, float] = {}
 
-    def say(self, kind: str, sentence: str, now: float) -> bool:
+    def warn(self, kind: str, sentence: str, now: float) -> bool:
         """A trouble shows now [monotonic s]; True if it was logged."""
         before = self._seen.get(kind, -inf)
         if kind not in self._seen and len(self._seen) >= _MOST:

@@ -370,7 +370,7 @@ class Agent:
         try:
             token = self._config.fresh_token()
         except Exception as error:  # a file that is being written, or gone
-            self._log_throttle.say("token", f"no newer token: {error}", self._clock())
+            self._log_throttle.warn("token", f"no newer token: {error}", self._clock())
             return False
         known, self._token = self._token, token
         if token != known:
@@ -399,7 +399,7 @@ class Agent:
                 known = session.connected
                 self._site_prober.live(PathQuality(found.rtt, nan, found.loss) if known else PathQuality())
             for kind, sentence in self._manager.troubles():
-                self._log_throttle.say(kind, sentence, now)
+                self._log_throttle.warn(kind, sentence, now)
 
     def _follow(self, instance: rest.Instance) -> None:
         """The orchestrator said something about an instance: open a session to it, or follow the service's address.

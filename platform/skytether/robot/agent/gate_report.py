@@ -68,7 +68,7 @@ class GateReporter:
         try:
             self._client.report_gate(self._robot, report)
         except (ApiError, Unreachable) as error:
-            self._log_throttle.say("told", f"the orchestrator does not hear how the gate is: {error}", now)
+            self._log_throttle.warn("told", f"the orchestrator does not hear how the gate is: {error}", now)
             if isinstance(error, ApiError) and error.problem.status == _REFUSED:
                 self._on_refused()
             return
@@ -80,4 +80,4 @@ class GateReporter:
             try:
                 self.step()
             except Exception as error:  # one strange answer must not be the last word on the gate
-                self._log_throttle.say("strange", f"how the gate is could not be told: {error!r}", self._clock())
+                self._log_throttle.warn("strange", f"how the gate is could not be told: {error!r}", self._clock())

@@ -95,7 +95,7 @@ class RemoteStop:
                 self._remember(order)
             self._client.acknowledge_stop(self._robot, order.id)
         except (ApiError, Unreachable) as error:
-            self._log_throttle.say("orders", f"orders to stop cannot be heard of: {error}", self._clock())
+            self._log_throttle.warn("orders", f"orders to stop cannot be heard of: {error}", self._clock())
 
     def run(self, ended: threading.Event) -> None:
         """Look until told to end."""
@@ -103,14 +103,14 @@ class RemoteStop:
             try:
                 self.step()
             except Exception as error:  # one strange answer must not be the last one that is read
-                self._log_throttle.say("strange", f"an order to stop could not be read: {error!r}", self._clock())
+                self._log_throttle.warn("strange", f"an order to stop could not be read: {error!r}", self._clock())
 
     def _obey(self, order: StopOrder) -> bool:
         """Whether the robot is stopped, and that is on a disk."""
         try:
             answer = self._stop(self._folder, _reason(order))
         except GateError as error:
-            self._log_throttle.say("gate", f"an order to stop could not be obeyed: {error}", self._clock())
+            self._log_throttle.warn("gate", f"an order to stop could not be obeyed: {error}", self._clock())
             return False
         _log.warning("%s", _reason(order))
         self._unkept = order.id if "note" in answer else ""
@@ -133,7 +133,7 @@ class RemoteStop:
         kept = self._obey(order)
         if self._unkept:
             sentence = "a stop from afar is in effect, but could not be kept: it is not acknowledged yet"
-            self._log_throttle.say("kept", sentence, self._clock())
+            self._log_throttle.warn("kept", sentence, self._clock())
         return kept
 
     def _of_guard(self) -> dict[str, Any]:
@@ -141,7 +141,7 @@ class RemoteStop:
         try:
             return self._status(self._folder).get("guard") or {}
         except GateError as error:
-            self._log_throttle.say("gate", f"whether an order to stop was kept is not known: {error}", self._clock())
+            self._log_throttle.warn("gate", f"whether an order to stop was kept is not known: {error}", self._clock())
             return {}
 
     def _read(self) -> list[str]:
@@ -166,7 +166,7 @@ class RemoteStop:
             os.replace(part, self._folder / FILE)
         except OSError as error:
             sentence = f"an order that was obeyed cannot be kept: {error}; it may stop the robot again once"
-            self._log_throttle.say("disk", sentence, self._clock())
+            self._log_throttle.warn("disk", sentence, self._clock())
 
 
 def _reason(order: StopOrder) -> str:

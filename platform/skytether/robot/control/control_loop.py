@@ -248,7 +248,7 @@ class ControlLoop:
         if isfinite(self._quiet):
             self._quiet = 0.0  # whether the cloud is there is found out from now on
         sentence = f"the control loop stood still for {stood:.2f} s; the robot goes on from standstill"
-        self._log_throttle.say("stall", f"control: {sentence}", now)
+        self._log_throttle.warn("stall", f"control: {sentence}", now)
 
     def _take_readings(self, now: float) -> None:
         for topic, message in self._hardware.read(now):
@@ -360,7 +360,7 @@ class ControlLoop:
             self._why = why
         since = self._choice.good_since
         if link.owes and self._choice.source is not Source.CLOUD and since and now - since > self._needs.good_s:
-            self._log_throttle.say("owes", f"control: {_OWES}", now)
+            self._log_throttle.warn("owes", f"control: {_OWES}", now)
 
     def _drive(self, now: float) -> Velocity:
         source = self._choice.source
@@ -400,7 +400,7 @@ class ControlLoop:
         for objection in objections:
             self._objections[objection] += 1
             if objection in _NAMED:
-                self._log_throttle.say(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
+                self._log_throttle.warn(f"{source} {objection}", f"commands of {source}: {_NAMED[objection]}", now)
 
     def _max_age(self, source: str) -> float:
         return supervisor.max_age(self._limits, source, self._needs.max_rtt_s)

@@ -110,7 +110,7 @@ class SharedTopicsExchange:
         try:
             found = self._client.share(serving.instance, self._said(serving.session, now))
         except (ApiError, Unreachable) as error:
-            self._log_throttle.say("shared", f"nothing is shared with other robots: {error}", now)
+            self._log_throttle.warn("shared", f"nothing is shared with other robots: {error}", now)
             if isinstance(error, ApiError) and error.problem.status == _REFUSED:
                 self._on_refused()
             return
@@ -128,7 +128,7 @@ class SharedTopicsExchange:
             try:
                 self.step()
             except Exception as error:  # one strange answer must not be the last one
-                self._log_throttle.say(
+                self._log_throttle.warn(
                     "strange", f"nothing could be shared with other robots: {error!r}", self._clock()
                 )
 
@@ -140,9 +140,9 @@ class SharedTopicsExchange:
         try:
             text = decode(String, message.payload, session.encoding).data
         except DecodeError as error:
-            self._log_throttle.say("decode", f"what the service shares is left out: {error}", now)
+            self._log_throttle.warn("decode", f"what the service shares is left out: {error}", now)
             return Share()
         if why := unshareable(text):
-            self._log_throttle.say("unshareable", f"what the service shares is left out: {why}", now)
+            self._log_throttle.warn("unshareable", f"what the service shares is left out: {why}", now)
             return Share()
         return Share(text=text, age_s=min(max(0.0, now - message.received_at), 3600.0))

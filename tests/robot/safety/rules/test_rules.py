@@ -345,7 +345,7 @@ def test_each_trouble_is_named_once(caplog):
         bench.send(9.0, 9.0)
         bench.gate.sense("odom", Twist(), bench.now)
         for kind, sentence in bench.run().troubles.items():
-            notices.say(kind, sentence, bench.now)
+            notices.warn(kind, sentence, bench.now)
     said = [record.message for record in caplog.records]
     assert 3 <= len(said) == len(set(said)) <= 6
     assert any("odom" in sentence for sentence in said)

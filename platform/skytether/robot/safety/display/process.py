@@ -116,13 +116,13 @@ class Display:
     def _draw(self, data: bytes, now: float) -> None:
         seen = unpack(data)
         if seen is None:
-            self._log_throttle.say("bytes", "something that is no snapshot comes to the display's socket", now)
+            self._log_throttle.warn("bytes", "something that is no snapshot comes to the display's socket", now)
             return
         try:
             drawn = picture(self._places.of(seen.modes & self._known), seen.asked, seen.told)
             self._publish(markers(seen, drawn, self._frame, self._lasts))
         except Exception as error:  # the next one may be drawn
-            self._log_throttle.say("draw", f"cannot draw what the gate says: {type(error).__name__}: {error}", now)
+            self._log_throttle.warn("draw", f"cannot draw what the gate says: {type(error).__name__}: {error}", now)
 
 
 def main() -> None:

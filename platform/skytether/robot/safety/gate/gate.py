@@ -211,7 +211,7 @@ class GateLoop:
         return sentence_of_others(self._config.wheels_at(), names) if names else ""
 
     def _trouble(self, kind: str, sentence: str, now: float) -> None:
-        if self._log_throttle.say(kind, sentence, now):
+        if self._log_throttle.warn(kind, sentence, now):
             self._heartbeat.note(sentence)
 
     def _tell_agent(self, agent: Any, decision: GateDecision, now: float) -> None:
@@ -272,7 +272,7 @@ def main() -> None:
     refused = privileges.acquire(privileges.GATE)
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
-    sensors = open_sensors(config, lambda kind, sentence: notices.say(kind, sentence, boottime()), estop)
+    sensors = open_sensors(config, lambda kind, sentence: notices.warn(kind, sentence, boottime()), estop)
     wheels = open_wheels(config, "gate")
     loop = GateLoop(config, guard, sensors, wheels, Board(int(sys.argv[3])), refused)
     gc.collect()

@@ -131,7 +131,7 @@ class Writer:
         try:
             self._wheels.enable(level)
         except Exception as error:  # then the signal does not change, and the power goes
-            self._log_throttle.say("enable", f"the enable signal cannot be published: {error}", self._clock())
+            self._log_throttle.warn("enable", f"the enable signal cannot be published: {error}", self._clock())
 
     def _tell(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
@@ -139,7 +139,7 @@ class Writer:
         try:
             return self._teller.write_velocity(now)
         except Exception as error:  # tried again in a moment
-            self._log_throttle.say("wheels", f"the wheels cannot be told anything: {error}", now)
+            self._log_throttle.warn("wheels", f"the wheels cannot be told anything: {error}", now)
             return True
 
 
