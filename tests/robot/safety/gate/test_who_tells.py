@@ -97,11 +97,11 @@ class Stage:
         if self.now < self.due["gate"]:
             return
         self.due["gate"] = max(self.due["gate"] + PERIOD, self.now)
-        self.heartbeat.hear()
+        self.heartbeat.receive()
         if (differs := self.heartbeat.differs(self.said, self.now)) is not None:
             self.said = differs.velocity
         faster = min(self.said.linear + 1.0 * PERIOD, WANTED.linear)
-        self.said = self.heartbeat.say(Velocity(faster, 0.0), "", False, self.now)
+        self.said = self.heartbeat.send(Velocity(faster, 0.0), "", False, self.now)
 
     def _guard(self):
         heard = None

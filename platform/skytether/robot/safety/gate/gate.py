@@ -128,7 +128,7 @@ class GateLoop:
         _log.error("the guard is gone; the gate stops the wheels and ends")
         stood = 0.0
         while stood < _LAST_STOPS_S:
-            self._heartbeat.hear()
+            self._heartbeat.receive()
             now = self._clock()
             if not self._heir.may():
                 _log.error("another guard has the wheels by now; the gate ends")
@@ -139,7 +139,7 @@ class GateLoop:
 
     def turn(self) -> None:
         """One turn of the loop."""
-        self._heartbeat.hear()
+        self._heartbeat.receive()
         now = self._clock()
         if now - self._turned_at > self._config.guard_s:
             self._gate.stalled(now)
@@ -156,7 +156,7 @@ class GateLoop:
         decision = self._gate.step(now)
         self._last = decision
         self._turns += 1
-        self._said = self._heartbeat.say(decision.velocity, self._gate.stopped, self._control.resets, now)
+        self._said = self._heartbeat.send(decision.velocity, self._gate.stopped, self._control.resets, now)
         if self._said != decision.velocity:
             self._gate.rebase(self._said, now)
         self._requests.turn()

@@ -60,7 +60,7 @@ class Heartbeat:
         self._teller = Teller(wheels, self._watch, board, Role.SECOND, period_s, clock)
         self._trouble = trouble
 
-    def hear(self) -> None:
+    def receive(self) -> None:
         """Take in what the guard answers, and what the wheels were told."""
         self._teller.refresh()
         for _ in range(_PACKETS):
@@ -86,7 +86,7 @@ class Heartbeat:
         """What the gate is to go on from instead of what it said; None: that is as good. See `differs`."""
         return differs(self._watch.told, said, now, self._patience_s, self._period_s)
 
-    def say(self, velocity: Velocity, stopped: str, reset: bool, now: float) -> Velocity:
+    def send(self, velocity: Velocity, stopped: str, reset: bool, now: float) -> Velocity:
         """Tell the guard what is wanted; the wheels, if nobody else tells them anything.
 
         Args:
