@@ -84,17 +84,17 @@ class Writer:
             if not self._heir.may():
                 _log.error("another guard has the wheels by now; the writer ends")
                 return
-            self._tell(now)
+            self._write_velocity(now)
             stood = stood + self._period if self._watch.told.velocity == STANDSTILL else 0.0
             select.select([], [], [], self._period)
 
     def turn(self) -> None:
         """Take in what the guard wants, and tell the wheels if it is time."""
-        heard = self._hear()
+        heard = self._receive()
         now = self._clock()
         if self._gone or (not heard and now < self._due):
             return
-        told = self._tell(now)
+        told = self._write_velocity(now)
         self._due = self._watch.due(now, self._repeat_s) if told else now + self._period / 2
         try:
             self._guard.send(pack_answer(Answer(now, stopped=self._teller.unread)))
@@ -103,7 +103,7 @@ class Writer:
         except OSError:
             self._gone = True
 
-    def _hear(self) -> bool:
+    def _receive(self) -> bool:
         """Take in what the guard wants. True if that is newer than what it wanted before."""
         newest = None
         for _ in range(_PACKETS):
@@ -133,7 +133,7 @@ class Writer:
         except Exception as error:  # then the signal does not change, and the power goes
             self._log_throttle.warn("enable", f"the enable signal cannot be published: {error}", self._clock())
 
-    def _tell(self, now: float) -> bool:
+    def _write_velocity(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
         self._teller.refresh()
         try:
