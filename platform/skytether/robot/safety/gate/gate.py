@@ -147,7 +147,7 @@ class GateLoop:
         for topic, message in self._sensors.stops():  # before all else, a reset above all
             self._gate.sense(topic, message, now)
         self._control.turn(now)
-        agent = self._take_commands(now)
+        agent = self._receive_commands(now)
         wall = time.time()
         for topic, message in self._sensors.read():
             self._gate.sense(topic, message, now, wall)
@@ -166,7 +166,7 @@ class GateLoop:
             self._others_noticed = self._others.noticed
             self._heartbeat.note(self._other_publishers)
         if agent:
-            self._tell_agent(agent, decision, now)
+            self._send_state(agent, decision, now)
         if self._feed is not None:
             self._show(self._feed, decision, now)
 
@@ -178,7 +178,7 @@ class GateLoop:
         if self._feed is not None:
             self._feed.close()
 
-    def _take_commands(self, now: float) -> Any:
+    def _receive_commands(self, now: float) -> Any:
         """Take in what the agent wants; the address of the agent, None: it said nothing."""
         agent = None
         arrived, strange = receive_known(self._commands, self._known, 256, _COMMANDS_EACH_TURN)
@@ -214,7 +214,7 @@ class GateLoop:
         if self._log_throttle.warn(kind, sentence, now):
             self._heartbeat.note(sentence)
 
-    def _tell_agent(self, agent: Any, decision: GateDecision, now: float) -> None:
+    def _send_state(self, agent: Any, decision: GateDecision, now: float) -> None:
         told = self._heartbeat.told(now)
         state = GateState(now, told.velocity, told.at, self._stopped, decision.hand, self._gate.started)
         with suppress(OSError):  # it is gone, or does not read; it asks again
