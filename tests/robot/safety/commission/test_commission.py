@@ -22,7 +22,7 @@ class FakeRig:
     def now(self) -> float:
         return self.time
 
-    def tell(self, velocity: Velocity | None, seconds: float) -> None:
+    def write_velocity(self, velocity: Velocity | None, seconds: float) -> None:
         for _ in range(max(1, round(seconds / TURN))):
             self.time += TURN
             self.turns += 1

@@ -79,11 +79,11 @@ def rig(driver: Driver) -> Iterator[HardwareRig]:
 
 @pytest.mark.parametrize("paused", ["wheels", "power"])
 def test_a_driver_that_pauses_for_half_a_second_goes_on(rig: HardwareRig, driver: Driver, paused: str) -> None:
-    rig.tell(SLOWLY, 0.1)
+    rig.write_velocity(SLOWLY, 0.1)
     driver.pauses[paused] = True
-    rig.tell(SLOWLY, 0.5)
+    rig.write_velocity(SLOWLY, 0.5)
     driver.pauses[paused] = False
-    rig.tell(STANDSTILL, 0.1)
+    rig.write_velocity(STANDSTILL, 0.1)
     assert driver.told[-1] == 0.0
     assert driver.levels[-1] is not driver.levels[-2]  # it changes again
 
@@ -95,5 +95,5 @@ def test_one_that_does_not_read_any_more_is_named(rig: HardwareRig, driver: Driv
     driver.pauses[paused] = True
     began = driver.time
     with pytest.raises(CommissionError, match=f"{what}: whoever .* has read nothing for 1 s"):
-        rig.tell(SLOWLY, 3.0)
+        rig.write_velocity(SLOWLY, 3.0)
     assert driver.time - began > 1.0

@@ -43,7 +43,7 @@ class Rig(Protocol):
         """Seconds."""
         ...
 
-    def tell(self, velocity: Velocity | None, seconds: float) -> None:
+    def write_velocity(self, velocity: Velocity | None, seconds: float) -> None:
         """Tell the wheels a velocity, again and again, for so long; None: tell them nothing.
 
         Raises:
@@ -189,7 +189,7 @@ class Commission:
             return _left_out("watchdog")
         self._steady(0, speed)
         since = self._rig.now()
-        self._rig.tell(None, _PATIENCE_S)
+        self._rig.write_velocity(None, _PATIENCE_S)
         stood = self._stood_at(since, 0)
         self._halt()
         if stood is None:
@@ -242,12 +242,12 @@ class Commission:
         self._halt()
         self._rig.power(False)
         try:
-            self._rig.tell(STANDSTILL, 1.0)
+            self._rig.write_velocity(STANDSTILL, 1.0)
             since = self._rig.now()
-            self._rig.tell(Velocity(speed, 0.0), _STEADY_S)
+            self._rig.write_velocity(Velocity(speed, 0.0), _STEADY_S)
             fastest = max((abs(v.linear) for _, v in self._rig.motion(since)), default=inf)
         finally:
-            self._rig.tell(STANDSTILL, 0.2)
+            self._rig.write_velocity(STANDSTILL, 0.2)
             self._rig.power(True)
         ok = fastest <= self._plan.tolerance.linear
         says = (
@@ -273,13 +273,13 @@ class Commission:
 
     def _steady(self, axis: int, speed: float) -> float:
         """Ramp up to a velocity and hold it; the mean of what was measured at its end."""
-        self._rig.tell(STANDSTILL, _WAKE_S)
+        self._rig.write_velocity(STANDSTILL, _WAKE_S)
         limits = self._plan.limits
         rate = (limits.linear_acceleration, limits.angular_acceleration)[axis]
         ramp = max(1, round(speed / rate / _RAMP_S))
         for k in range(1, ramp + 1):
-            self._rig.tell(_along(axis, speed * k / ramp), _RAMP_S)
-        self._rig.tell(_along(axis, speed), _STEADY_S)
+            self._rig.write_velocity(_along(axis, speed * k / ramp), _RAMP_S)
+        self._rig.write_velocity(_along(axis, speed), _STEADY_S)
         late = self._rig.motion(self._rig.now() - _STEADY_S / 2)
         if not late:
             raise CommissionError("the odometry was not heard while the robot drove")
@@ -297,14 +297,14 @@ class Commission:
                 raise CommissionError(
                     f"the robot still moves {_PATIENCE_S:g} s after it was told to stand: cut the power"
                 )
-            self._rig.tell(STANDSTILL, 0.1)
+            self._rig.write_velocity(STANDSTILL, 0.1)
 
     def _stop_from(self, axis: int, speed: float) -> Stop | None:
         """Braking from a velocity: the word comes at once, as in an emergency."""
         real = self._steady(axis, speed)
         since = self._rig.now()
         while (stood := self._stood_at(since, axis)) is None and self._rig.now() - since <= _PATIENCE_S:
-            self._rig.tell(STANDSTILL, 0.1)
+            self._rig.write_velocity(STANDSTILL, 0.1)
         if stood is None:
             return None
         return Stop(abs(real), _way(self._rig.motion(since), since, stood, axis), stood - since)
@@ -324,7 +324,7 @@ class Commission:
         while self._rig.pressed() is not pressed:
             if self._rig.now() > end:
                 return False
-            self._rig.tell(None, 0.05)
+            self._rig.write_velocity(None, 0.05)
         return True
 
 

@@ -55,7 +55,7 @@ class HardwareRig:
         self._config, self._odometry = config, config.odometry
         self._clock, self._sleep = clock, sleep
         self._period = 1 / config.rate_hz
-        self._lock = _take_folder(config)
+        self._lock = _lock_folder(config)
         self._refuse_a_stopped_robot()
         self._motion: deque[tuple[float, Velocity]] = deque(maxlen=_READINGS)
         self._button: tuple[bool, float] | None = None
@@ -69,7 +69,7 @@ class HardwareRig:
             self._sensors = open_sensors(config, lambda *_: None)
             if config.enable is not None and config.enable.topic is None:
                 self._line = open_line(config.enable_words())
-            self._hear_all()
+            self._wait_for_sensors()
         except OSError as error:
             self.close()
             raise CommissionError(f"the robot cannot be had: {error}") from error
@@ -81,7 +81,7 @@ class HardwareRig:
         """Rig: seconds since the machine was started."""
         return self._clock()
 
-    def tell(self, velocity: Velocity | None, seconds: float) -> None:
+    def write_velocity(self, velocity: Velocity | None, seconds: float) -> None:
         """Rig: write at the gate's rate; see the protocol."""
         end = self.now() + seconds
         while True:
@@ -134,14 +134,14 @@ class HardwareRig:
             self._lock.close()
             raise CommissionError(f"the robot is stopped: {stopped}; start its gate and say: skytether robot reset")
 
-    def _hear_all(self) -> None:
+    def _wait_for_sensors(self) -> None:
         """Wait until odometry and button are heard, and the robot stands."""
         end = self.now() + _START_S
         while not self._motion or (self._config.estop is not None and self.pressed() is None):
             if self.now() > end:
                 what = "odometry" if not self._motion else "emergency stop button"
                 raise CommissionError(f"the {what} is not heard; see that its driver runs")
-            self.tell(None, 0.1)
+            self.write_velocity(None, 0.1)
 
     def _read(self) -> None:
         if self._sensors is None:
@@ -188,7 +188,7 @@ class HardwareRig:
             raise CommissionError(f"{trouble}: {error}") from error
 
 
-def _take_folder(config: SafetyConfig) -> IO[bytes]:
+def _lock_folder(config: SafetyConfig) -> IO[bytes]:
     folder = config.place()
     try:
         folder.mkdir(parents=True, exist_ok=True)
