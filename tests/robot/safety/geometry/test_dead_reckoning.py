@@ -13,7 +13,7 @@ THING = np.array([[2.0, 0.0]])
 def told(*turns: tuple[float, float, float]) -> DeadReckoning:
     reckoning = DeadReckoning(10.0)
     for at, linear, angular in turns:
-        reckoning.tell(Velocity(linear, angular), at)
+        reckoning.update(Velocity(linear, angular), at)
     return reckoning
 
 
@@ -64,8 +64,8 @@ def test_what_is_old_is_forgotten_and_a_clock_that_goes_back_begins_anew():
     reckoning = DeadReckoning(1.0)
     sizes = []
     for i in range(1000):
-        reckoning.tell(Velocity(0.1, 0.0), i * 0.1)
+        reckoning.update(Velocity(0.1, 0.0), i * 0.1)
         sizes.append(deep_size(reckoning))
     assert max(sizes) < 2 * sizes[12]
-    reckoning.tell(Velocity(0.1, 0.0), 5.0)
+    reckoning.update(Velocity(0.1, 0.0), 5.0)
     assert reckoning.now_at(THING, 4.0, 6.0) == pytest.approx(np.array([[1.9, 0.0]]))

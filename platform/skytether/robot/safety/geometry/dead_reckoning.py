@@ -56,7 +56,7 @@ class DeadReckoning:
         self._longest = longest_s
         self._told: deque[_Told] = deque(maxlen=_TURNS)
 
-    def tell(self, velocity: Velocity, now: float) -> None:
+    def update(self, velocity: Velocity, now: float) -> None:
         """The wheels are told this from now on."""
         told = self._told
         if not isfinite(now) or (told and now < told[-1].at):  # nothing before can be placed in time any more

@@ -220,7 +220,7 @@ class Gate:
             at: When [s]; before the time of the next step.
         """
         before = self._supervised.now
-        self._reckoning.tell(velocity, at if before is None else max(at, before))
+        self._reckoning.update(velocity, at if before is None else max(at, before))
         self._supervised = replace(self._supervised, velocity=velocity, now=at)
 
     def step(self, now: float) -> GateDecision:
@@ -234,7 +234,7 @@ class Gate:
             troubles["internal"] = f"the gate itself failed and stops the robot: {type(error).__name__}: {error}"
             decision = GateDecision(STANDSTILL, Hand.NOBODY, Zone.STOP, 0.0, 0.0, troubles)
             self._supervised = Supervised(held=self._supervised.held)
-        self._reckoning.tell(decision.velocity, now)
+        self._reckoning.update(decision.velocity, now)
         if self._motion is not None:
             self._motion.told(decision.velocity, now)
         self.counts.update(troubles.keys())
