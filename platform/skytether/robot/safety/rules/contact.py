@@ -77,7 +77,7 @@ class Contacts:
         self._heard: dict[str, tuple[bool, float]] = {}
         self._felt_at: dict[str, float] = {}
 
-    def hear(self, topic: str, message: Message, now: float) -> str:
+    def on_message(self, topic: str, message: Message, now: float) -> str:
         """Take a message in.
 
         Returns:

@@ -156,7 +156,7 @@ class Gate:
             if wrong is not None:
                 self._event(*wrong)
         elif topic in self._rules.contacts and isinstance(message, self._rules.contacts[topic].message):
-            reason = self._contacts.hear(topic, message, now)
+            reason = self._contacts.on_message(topic, message, now)
             if reason:
                 self.engage(reason)
         elif topic == self._rules.modes.topic and isinstance(message, String):
