@@ -110,10 +110,10 @@ def test_the_first_reason_of_an_emergency_stop_is_kept_until_reset():
 
 def test_a_pressed_button_latches_and_is_not_reset_while_pressed():
     button = ButtonParams(pressed_is=True, max_age_s=0.5)
-    state = estop.hear(button, Estop(), True, 1.0)
+    state = estop.on_button(button, Estop(), True, 1.0)
     assert "button was pressed" in state.reason
     assert "still pressed" in estop.reset(button, state, 1.1)[1]
-    state = estop.hear(button, state, False, 1.2)
+    state = estop.on_button(button, state, False, 1.2)
     assert state.reason  # letting go is not enough
     assert "not heard" in estop.reset(button, state, 1.8)[1]
     state, refused = estop.reset(button, state, 1.3)
@@ -122,8 +122,8 @@ def test_a_pressed_button_latches_and_is_not_reset_while_pressed():
 
 def test_a_circuit_that_opens_is_pressed_when_false():
     button = ButtonParams(pressed_is=False)
-    assert estop.hear(button, Estop(), False, 0.0).reason
-    assert not estop.hear(button, Estop(), True, 0.0).reason
+    assert estop.on_button(button, Estop(), False, 0.0).reason
+    assert not estop.on_button(button, Estop(), True, 0.0).reason
 
 
 @pytest.mark.parametrize(

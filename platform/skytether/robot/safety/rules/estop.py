@@ -57,7 +57,7 @@ def engage(before: Estop, reason: str) -> Estop:
     return before if before.reason not in ("", FIRST_ACT) else replace(before, reason=reason)
 
 
-def hear(params: ButtonParams, before: Estop, value: bool, now: float) -> Estop:
+def on_button(params: ButtonParams, before: Estop, value: bool, now: float) -> Estop:
     """Take in what the button says."""
     pressed = value is params.pressed_is
     doubted_until = before.doubted_until if now < before.doubted_until else nan

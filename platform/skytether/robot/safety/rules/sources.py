@@ -223,7 +223,7 @@ class Sources:
             if topic in rules.locks:
                 self._locks[topic] = (bool(message.data), now)
             elif rules.button is not None:
-                self._latch = estop.hear(rules.button, self._latch, bool(message.data), now)
+                self._latch = estop.on_button(rules.button, self._latch, bool(message.data), now)
         elif isinstance(message, Joy) and rules.joystick is not None:
             return self._hear_joystick(rules.joystick, message, now)
         elif isinstance(message, Twist | TwistStamped) and topic in rules.further:
