@@ -60,26 +60,26 @@ def test_what_the_wheels_can_reach_in_one_tick(before, after, reached):
 
 
 def test_a_held_button_drives_and_letting_go_gives_back():
-    state, wrong = joystick.hear(PAD, RELEASED, joy([0.5, 1.0], [0, 1]), 1.0)
+    state, wrong = joystick.on_message(PAD, RELEASED, joy([0.5, 1.0], [0, 1]), 1.0)
     assert (state.grip, wrong) == (Grip.HELD, "")
     assert state.wanted == pytest.approx((0.2, 0.2))  # full forward, half left
-    assert joystick.look(PAD, state, 1.29).grip is Grip.HELD
-    state, _ = joystick.hear(PAD, state, joy([0.5, 1.0], [0, 0]), 1.4)
+    assert joystick.expire(PAD, state, 1.29).grip is Grip.HELD
+    state, _ = joystick.on_message(PAD, state, joy([0.5, 1.0], [0, 0]), 1.4)
     assert (state.grip, state.wanted) == (Grip.OFF, STANDSTILL)
 
 
 @pytest.mark.parametrize("now", [1.31, 0.69, nan, inf, -inf])
 def test_a_held_joystick_that_falls_silent_is_lost_until_it_is_heard_with_the_button_up(now):
-    held, _ = joystick.hear(PAD, RELEASED, joy([0, 1], [0, 1]), 1.0)
-    lost = joystick.look(PAD, held, now)
+    held, _ = joystick.on_message(PAD, RELEASED, joy([0, 1], [0, 1]), 1.0)
+    lost = joystick.expire(PAD, held, now)
     assert (lost.grip, lost.wanted) == (Grip.LOST, STANDSTILL)
-    assert joystick.look(PAD, lost, 1.0) == lost  # time alone does not give it back
-    again, _ = joystick.hear(PAD, lost, joy([0, 0], [0, 0]), 5.0)
+    assert joystick.expire(PAD, lost, 1.0) == lost  # time alone does not give it back
+    again, _ = joystick.on_message(PAD, lost, joy([0, 0], [0, 0]), 5.0)
     assert again.grip is Grip.OFF
 
 
 def test_a_joystick_that_was_not_held_may_be_silent():
-    assert joystick.look(PAD, Joystick(), 1e6).grip is Grip.OFF
+    assert joystick.expire(PAD, Joystick(), 1e6).grip is Grip.OFF
 
 
 @pytest.mark.parametrize(
@@ -92,13 +92,13 @@ def test_a_joystick_that_was_not_held_may_be_silent():
     ],
 )
 def test_a_joystick_of_another_make_drives_nothing(message, grip, says):
-    state, wrong = joystick.hear(PAD, RELEASED, message, 1.0)
+    state, wrong = joystick.on_message(PAD, RELEASED, message, 1.0)
     assert (state.grip, state.wanted) == (grip, STANDSTILL)
     assert says in wrong
 
 
 def test_axes_beyond_their_end_are_at_their_end():
-    state, _ = joystick.hear(PAD, RELEASED, joy([-7, 3], [0, 1]), 1.0)
+    state, _ = joystick.on_message(PAD, RELEASED, joy([-7, 3], [0, 1]), 1.0)
     assert state.wanted == pytest.approx((0.2, -0.4))
 
 

@@ -108,7 +108,7 @@ def test_no_sequence_lets_a_joystick_drive_that_was_not_seen_released_since_it_w
     for what, then in sequence:
         now += then
         if what == "wait":
-            state = joystick.look(PAD, state, now)
+            state = joystick.expire(PAD, state, now)
         else:
             if what == "moved":
                 moved += 0.01
@@ -118,7 +118,7 @@ def test_no_sequence_lets_a_joystick_drive_that_was_not_seen_released_since_it_w
             elif what == "down":
                 newest = joy(0.5, 0.0)
             message = Joy() if what == "short" else newest
-            state, _ = joystick.hear(PAD, state, message, now)
+            state, _ = joystick.on_message(PAD, state, message, now)
             if what != "short":
                 history.append((now, "held" if newest.buttons[0] else "up"))
         if state.grip is Grip.LOST and (not history or history[-1][1] != "lost"):
@@ -147,17 +147,17 @@ def _was_released(history: list[tuple[float, str]]) -> bool:
 
 def test_a_silence_that_a_message_ends_was_one_all_the_same():
     """The gate was frozen while the joystick was silent: nothing looked at it in between."""
-    held, _ = joystick.hear(PAD, Joystick(seen_released=True), joy(1.0, 0.0), 1.0)
-    assert joystick.hear(PAD, held, joy(1.0, 0.0), 3.0)[0].grip is Grip.LOST
+    held, _ = joystick.on_message(PAD, Joystick(seen_released=True), joy(1.0, 0.0), 1.0)
+    assert joystick.on_message(PAD, held, joy(1.0, 0.0), 3.0)[0].grip is Grip.LOST
 
 
 def test_what_waited_in_a_queue_is_no_release_and_press_of_now():
     state = Joystick(grip=Grip.LOST, lost="fell silent")
     for held in (False, True):
-        state, _ = joystick.hear(PAD, state, joy(1.0, 0.0, held=held), 5.0)
+        state, _ = joystick.on_message(PAD, state, joy(1.0, 0.0, held=held), 5.0)
     assert state.grip is Grip.UNSURE
-    state, _ = joystick.hear(PAD, state, joy(1.0, 0.0, held=False), 5.1)
-    state, _ = joystick.hear(PAD, state, joy(1.0, 0.0), 5.35)
+    state, _ = joystick.on_message(PAD, state, joy(1.0, 0.0, held=False), 5.1)
+    state, _ = joystick.on_message(PAD, state, joy(1.0, 0.0), 5.35)
     assert state.grip is Grip.HELD
 
 
@@ -166,7 +166,7 @@ def test_a_driver_that_repeats_itself_when_the_radio_is_gone_drives_for_a_second
     state, driven = Joystick(seen_released=True), 0.0
     for k in range(100):
         repeat = replace(joy(1.0, 0.0), header=Header(stamp=Time(sec=k)))
-        state, _ = joystick.hear(PAD, state, repeat, 10 + k * 0.05)
+        state, _ = joystick.on_message(PAD, state, repeat, 10 + k * 0.05)
         driven += 0.05 if state.wanted != STANDSTILL else 0.0
     assert state.grip is Grip.LOST
     assert "says the same for 1 s" in state.lost
@@ -176,25 +176,25 @@ def test_a_driver_that_repeats_itself_when_the_radio_is_gone_drives_for_a_second
 def test_a_hand_that_is_not_quite_still_and_a_cable_drive_on():
     state = Joystick(seen_released=True)
     for k in range(200):
-        state, _ = joystick.hear(PAD, state, joy(1.0, 0.0, 0.01 * (k // 10 % 2)), 10 + k * 0.05)
+        state, _ = joystick.on_message(PAD, state, joy(1.0, 0.0, 0.01 * (k // 10 % 2)), 10 + k * 0.05)
     assert state.grip is Grip.HELD
     cable, state = replace(PAD, max_still_s=inf), Joystick(seen_released=True)
     for k in range(200):
-        state, _ = joystick.hear(cable, state, joy(1.0, 0.0), 10 + k * 0.05)
+        state, _ = joystick.on_message(cable, state, joy(1.0, 0.0), 10 + k * 0.05)
     assert state.grip is Grip.HELD
 
 
 def test_a_stick_in_its_middle_may_be_still():
     state = Joystick(seen_released=True)
     for k in range(200):
-        state, _ = joystick.hear(PAD, state, joy(0.0, 0.0), 10 + k * 0.05)
+        state, _ = joystick.on_message(PAD, state, joy(0.0, 0.0), 10 + k * 0.05)
     assert (state.grip, state.wanted) == (Grip.HELD, STANDSTILL)
 
 
 @pytest.mark.parametrize(("axis", "share"), [(0.09, 0.0), (-0.09, 0.0), (0.55, 0.5), (1.0, 1.0), (-1.0, -1.0)])
 def test_the_dead_zone_ends_without_a_jump(axis, share):
     # Beyond 0.1 the rest of the axis, 0.9 long, goes from nothing to everything.
-    state, _ = joystick.hear(replace(PAD, deadzone=0.1), Joystick(seen_released=True), joy(axis, 0.0), 1.0)
+    state, _ = joystick.on_message(replace(PAD, deadzone=0.1), Joystick(seen_released=True), joy(axis, 0.0), 1.0)
     assert state.wanted.linear == pytest.approx(0.2 * share)
 
 
@@ -257,8 +257,8 @@ def test_a_clock_that_is_no_number_makes_nobody_neutral(now):
     for when in (10.0, 10.09, now, now, 10.09, now):
         state = restart_interlock.want(state, STANDSTILL, when, TIMEOUT)
         assert state.why
-    up, _ = joystick.hear(PAD, Joystick(), joy(0.0, 0.0, held=False), 10.0)
-    assert joystick.hear(PAD, up, joy(1.0, 0.0), now)[0].grip is not Grip.HELD
+    up, _ = joystick.on_message(PAD, Joystick(), joy(0.0, 0.0, held=False), 10.0)
+    assert joystick.on_message(PAD, up, joy(1.0, 0.0), now)[0].grip is not Grip.HELD
 
 
 @pytest.mark.parametrize(("said_s", "silent_s"), [(0.12, 0.14), (0.12, 0.44), (0.02, 0.4)])

@@ -87,14 +87,14 @@ class Joystick:
     lost: str = ""
 
 
-def hear(params: JoystickParams, before: Joystick, message: Joy, now: float) -> tuple[Joystick, str]:
+def on_message(params: JoystickParams, before: Joystick, message: Joy, now: float) -> tuple[Joystick, str]:
     """Take a message in.
 
     Returns:
         The new state, and what is wrong with the message (empty: nothing). Without the button a message is as good as
         any; with it, axes that are missing or no numbers leave the joystick held, at a standstill.
     """
-    before = look(params, before, now)  # a silence that this message ends was one all the same
+    before = expire(params, before, now)  # a silence that this message ends was one all the same
     if params.deadman >= len(message.buttons):
         return before, f"has {len(message.buttons)} buttons, and the deadman is number {params.deadman}"
     content = (message.axes[:_KEPT].tobytes(), message.buttons[:_KEPT].tobytes())
@@ -111,7 +111,7 @@ def hear(params: JoystickParams, before: Joystick, message: Joy, now: float) -> 
     return replace(heard, grip=Grip.HELD, wanted=wanted), wrong
 
 
-def look(params: JoystickParams, before: Joystick, now: float) -> Joystick:
+def expire(params: JoystickParams, before: Joystick, now: float) -> Joystick:
     """What has become of it by now. A clock that is no number or went back loses it too."""
     if before.grip in (Grip.HELD, Grip.UNSURE) and not _within(now - before.heard_at, params.max_age_s):
         return _lose(before, "fell silent with the button held")

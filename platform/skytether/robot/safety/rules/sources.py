@@ -177,7 +177,7 @@ class Sources:
     def stalled(self, now: float) -> None:
         """The gate stood still: commands that waited meanwhile are not followed, and the button is to be heard anew.
 
-        The age of an agent's command is known, and a joystick is looked after by `joystick.hear`.
+        The age of an agent's command is known, and a joystick is looked after by `joystick.on_message`.
         """
         self._settled_at = now + estop.SETTLES_S
         if self._rules.button is not None:
@@ -247,7 +247,7 @@ class Sources:
         """
         rules = self._rules
         if rules.joystick is not None:
-            self._joystick = joystick.look(rules.joystick, self._joystick, now)
+            self._joystick = joystick.expire(rules.joystick, self._joystick, now)
         floor = max(self._floor_of_locks(now, troubles), self._floor_of_joystick(troubles))
         if self._stops(now, troubles):
             return Hand.NOBODY
@@ -340,7 +340,7 @@ class Sources:
                 self._sources[name] = replace(source, neutral=restart_interlock.require(why), started=False)
 
     def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> tuple[Command | None, str]:
-        self._joystick, wrong = joystick.hear(params, self._joystick, message, now)
+        self._joystick, wrong = joystick.on_message(params, self._joystick, message, now)
         if self._joystick.grip is Grip.LOST:
             self._require("the joystick was lost", self._rules.joystick_priority)
         if self._joystick.grip is not Grip.HELD:
