@@ -114,7 +114,7 @@ class Modes:
         self._unknown = ""
         self._made: dict[frozenset[str], Envelope] = {frozenset(): base}
 
-    def hear(self, text: str, now: float) -> str:
+    def select(self, text: str, now: float) -> str:
         """Somebody says which modes hold: names with commas between; empty, ``none`` and ``normal``: none of them.
 
         Returns:

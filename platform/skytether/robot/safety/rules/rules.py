@@ -125,7 +125,7 @@ class Gate:
         return sorted(self._active)
 
     def set_modes(self, text: str, now: float) -> str:
-        """A person or a program of the robot says which modes hold; see `Modes.hear`.
+        """A person or a program of the robot says which modes hold; see `Modes.select`.
 
         Returns:
             Why it is refused; empty: it is not.
@@ -134,7 +134,7 @@ class Gate:
             return "there are no modes (safety.modes)"
         if self._rules.modes.topic:
             return f"the topic {self._rules.modes.topic} says which modes hold (safety.mode.topic)"
-        refused = self._modes.hear(text, now)
+        refused = self._modes.select(text, now)
         self._active = self._modes.active(now, {})
         return refused
 
@@ -160,7 +160,7 @@ class Gate:
             if reason:
                 self.engage(reason)
         elif topic == self._rules.modes.topic and isinstance(message, String):
-            if unknown := self._modes.hear(message.data, now):
+            if unknown := self._modes.select(message.data, now):
                 self._event("mode:message", f"{topic}: {unknown}")
         elif self._sources.expects(topic, message):
             self._hear(topic, message, now)
