@@ -35,7 +35,7 @@ class Bench:
             self.wheels.roll(self.now, TURN)
             if self.turns % round(READING / TURN) == 0:
                 self.motion.measure(odometry(*self.wheels.reading(self.now), self.now), self.now)
-            self.seen = self.motion.look(self.now)
+            self.seen = self.motion.estimate(self.now)
             if self.seen.fault:
                 self.faults.append((self.now, self.seen.fault, self.seen.detail))
 
@@ -132,14 +132,14 @@ def test_a_reading_that_comes_first_after_a_long_pause_is_not_judged():
     for pause in (5.0, 1e6, math.inf, math.nan):
         assert bench.motion.measure(odometry(0.0, 0.0, 5.0 + bench.turns), bench.now + pause) == ""
         bench.turns += 1
-    assert bench.motion.look(bench.now).fault is None
+    assert bench.motion.estimate(bench.now).fault is None
 
 
 wild = st.one_of(st.floats(), st.sampled_from([0.0, 0.02, 0.2, math.nan, math.inf, -math.inf, 1e308]))
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(st.sampled_from(["told", "measure", "look"]), wild, wild, wild), max_size=60))
+@given(st.lists(st.tuples(st.sampled_from(["told", "measure", "estimate"]), wild, wild, wild), max_size=60))
 def test_whatever_comes_and_whatever_the_clock_does_nothing_is_raised(events):
     motion, now = Motion(PARAMS, LIMITS, 0.1), 10.0
     for k, (what, first, second, dt) in enumerate(events):
@@ -149,7 +149,7 @@ def test_whatever_comes_and_whatever_the_clock_does_nothing_is_raised(events):
         elif what == "measure":
             motion.measure(odometry(first, second, float(k)), now)
         else:
-            motion.look(now)
+            motion.estimate(now)
 
 
 def test_one_reading_outside_is_no_fault():
@@ -166,20 +166,20 @@ def test_what_is_no_number_is_not_known(bad):
     bench = Bench(Wheels())
     bench.drive(STANDSTILL, 1.0)
     bench.motion.measure(odometry(bad, 0.0, bench.now + 0.01), bench.now)
-    seen = bench.motion.look(bench.now)
+    seen = bench.motion.estimate(bench.now)
     assert seen.measured is None
     assert "no number" in seen.unknown
 
 
 def test_silence_and_the_same_reading_again_are_not_known():
     motion = Motion(PARAMS, LIMITS, 0.1)
-    assert "nothing has come" in motion.look(1.0).unknown
+    assert "nothing has come" in motion.estimate(1.0).unknown
     assert motion.measure(odometry(0.1, 0.0, 5.0), 1.0) == ""
-    assert motion.look(1.1).measured == Velocity(0.1, 0.0)
+    assert motion.estimate(1.1).measured == Velocity(0.1, 0.0)
     assert "same reading" in motion.measure(odometry(0.1, 0.0, 5.0), 1.3)
-    assert "silent for 0.4 s" in motion.look(1.4).unknown
-    assert motion.look(math.nan).unknown
-    assert motion.look(-50.0).unknown
+    assert "silent for 0.4 s" in motion.estimate(1.4).unknown
+    assert motion.estimate(math.nan).unknown
+    assert motion.estimate(-50.0).unknown
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_readings_that_are_not_newer_are_silence_and_hide_no_runaway(stamps, wro
         said = motion.measure(odometry(0.2, 0.0, stamps(turn)), now)
         if turn > 1:
             assert wrong in said or "same reading" in said
-    assert "is silent" in motion.look(now).unknown
+    assert "is silent" in motion.estimate(now).unknown
 
 
 def test_readings_that_begin_to_come_late_are_as_old_as_they_are():
@@ -209,14 +209,14 @@ def test_readings_that_begin_to_come_late_are_as_old_as_they_are():
             late = min(2.0, READING / 2 * max(0, turn - 20))
             assert motion.measure(odometry(0.2, 0.0, 5000 + now - late), now) == ""
             if turn == 25:
-                assert motion.look(now).measured, "what is a little late is known"
-        seen = motion.look(now)
+                assert motion.estimate(now).measured, "what is a little late is known"
+        seen = motion.estimate(now)
         assert (not seen.unknown) is known
         if not known:
             assert "s late by its stamp" in seen.unknown
             motion.relearn()
             motion.measure(odometry(0.2, 0.0, 5000 + now), now + 2.0)
-            assert motion.look(now + 2.0).measured, "a person has looked at the robot"
+            assert motion.estimate(now + 2.0).measured, "a person has looked at the robot"
 
 
 def test_readings_that_are_late_from_the_first_are_as_old_as_they_are_by_our_own_clock():
@@ -225,7 +225,7 @@ def test_readings_that_are_late_from_the_first_are_as_old_as_they_are_by_our_own
         for _ in range(20):
             now += READING
             assert motion.measure(odometry(0.2, 0.0, 5000 + now - 0.5), now, 5000 + now) == ""
-        seen = motion.look(now)
+        seen = motion.estimate(now)
         assert (not seen.unknown) is known
     assert "0.5 s late by its stamp" in seen.unknown
     assert "ahead of this computer's clock" in motion.measure(odometry(0.2, 0.0, 5001 + now), now, 5000 + now)
@@ -239,7 +239,7 @@ def test_a_reading_that_is_stale_is_no_fault_of_the_wheels():
         late = 3.0 if turn > 100 else 0.0
         if turn != 101 and (turn <= 100 or turn > 101 + 3.0 / READING):
             motion.measure(odometry(0.2, 0.0, now - late), now)
-        assert motion.look(now).fault is None
+        assert motion.estimate(now).fault is None
 
 
 def test_a_clock_of_the_readings_that_is_set_back_is_believed_again_after_a_second():
@@ -248,7 +248,7 @@ def test_a_clock_of_the_readings_that_is_set_back_is_believed_again_after_a_seco
     for turn in range(100):
         now += READING
         motion.measure(odometry(0.2, 0.0, now - (50.0 if turn > 20 else 0.0)), now)
-        known.append(not motion.look(now).unknown)
+        known.append(not motion.estimate(now).unknown)
     assert known[:21] == [True] * 21
     lost = known.index(False)
     assert 1.0 <= (known.index(True, lost) - 21) * READING <= 1.2
@@ -260,7 +260,7 @@ def test_the_drives_own_velocity_will_do():
     twist = Twist(linear=Vector3(x=0.2), angular=Vector3(z=0.1))
     for message in (twist, TwistStamped(header=Header(stamp=Time(sec=1)), twist=twist)):
         assert motion.measure(message, 1.0) == ""
-        assert motion.look(1.0).measured == (0.2, 0.1)
+        assert motion.estimate(1.0).measured == (0.2, 0.1)
     assert "no odometry" in motion.measure(Bool(), 1.0)
 
 

@@ -176,7 +176,7 @@ class Motion:
         """Forget how quick readings were, because a person looked at the robot."""
         self._stamps = Stamps()
 
-    def look(self, now: float) -> MotionEstimate:
+    def estimate(self, now: float) -> MotionEstimate:
         """What is known now. A fault is told once, in the look after the reading that showed it."""
         fault, self._fault = self._fault, None
         age = now - self._measured_at

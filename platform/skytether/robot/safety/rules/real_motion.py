@@ -128,7 +128,7 @@ class RealMotion:
         Returns:
             Why the robot must stand until a reset; empty: it need not.
         """
-        rules, seen = self._rules, self._motion.look(now)
+        rules, seen = self._rules, self._motion.estimate(now)
         self.action = rules.on_unknown if seen.unknown else Action.FREE
         if self.action is not Action.FREE:
             verb = "stands" if self.action is Action.STOP else "goes slowly"
