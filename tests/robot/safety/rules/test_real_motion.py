@@ -147,12 +147,12 @@ LIMIT_TOLERANCE = Velocity(0.05, 0.1)
 def test_a_hand_over_falls_to_the_measured_velocity_and_rises_from_there():
     handover = Handover(LIMITS, LIMIT_TOLERANCE)
     told, measured = Velocity(0.4, 0.2), Velocity(0.1, 0.2)
-    handover.look("agent", told, measured, 10.0)
+    handover.update("agent", told, measured, 10.0)
     # From 0.1 m/s at 1 m/s^2; the curve is kept.
     assert handover.share(told, 10.0) == pytest.approx(0.25)
     assert handover.share(told, 10.1) == pytest.approx(0.5)
     assert handover.share(told, 10.3) == 1.0
-    handover.look("agent", told, STANDSTILL, 10.31)  # the same driver
+    handover.update("agent", told, STANDSTILL, 10.31)  # the same driver
     assert handover.share(told, 10.31) == 1.0
 
 
@@ -162,7 +162,7 @@ def test_a_hand_over_falls_to_the_measured_velocity_and_rises_from_there():
 )
 def test_a_hand_over_is_not_faster_than_told_and_noise_is_none(measured):
     handover = Handover(LIMITS, LIMIT_TOLERANCE)
-    handover.look("agent", Velocity(0.4, 0.0), measured, 10.0)
+    handover.update("agent", Velocity(0.4, 0.0), measured, 10.0)
     assert handover.share(Velocity(0.4, 0.0), 10.0) == 1.0
 
 

@@ -52,7 +52,7 @@ class Handover:
         self._begun: tuple[float, float] | None = None
         self._at = 0.0
 
-    def look(self, hand: str, told: Velocity, measured: Velocity | None, now: float) -> None:
+    def update(self, hand: str, told: Velocity, measured: Velocity | None, now: float) -> None:
         """Take in who drives from now on.
 
         Args:
@@ -122,7 +122,7 @@ class RealMotion:
         """See `Motion.relearn`."""
         self._motion.relearn()
 
-    def look(self, now: float, troubles: dict[str, str]) -> str:
+    def update(self, now: float, troubles: dict[str, str]) -> str:
         """What is known now.
 
         Returns:
@@ -145,5 +145,5 @@ class RealMotion:
         """What a new driver may have of a velocity, so that it begins from the measured one."""
         if not self._rules.from_measured:
             return 1.0
-        self._handover.look(hand, before, self._measured, now)
+        self._handover.update(hand, before, self._measured, now)
         return self._handover.share(wanted, now)

@@ -244,7 +244,7 @@ class Gate:
         self._active = self._modes.active(now, troubles)
         self._place = place = self._places.of(self._active)
         before, dt = self._supervised.velocity, supervisor.elapsed(place.limits, self._supervised, now)
-        broken = self._motion.look(now, troubles) if self._motion is not None else ""
+        broken = self._motion.update(now, troubles) if self._motion is not None else ""
         if broken:
             self.engage(broken)
         hand = self._sources.look(now, troubles)
