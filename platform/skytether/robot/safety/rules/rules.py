@@ -247,7 +247,7 @@ class Gate:
         broken = self._motion.update(now, troubles) if self._motion is not None else ""
         if broken:
             self.engage(broken)
-        hand = self._sources.look(now, troubles)
+        hand = self._sources.select(now, troubles)
         silent = self._contacts.silent(now)
         if silent:
             troubles.update(silent)
@@ -301,7 +301,7 @@ class Gate:
         return {Action.STOP: 0.0, Action.SLOW: self._place.zones.slow(wanted), Action.FREE: 1.0}[action]
 
     def _hear(self, topic: str, message: Message, now: float) -> None:
-        command, wrong = self._sources.hear(topic, message, now)
+        command, wrong = self._sources.on_message(topic, message, now)
         if wrong:
             self._event(f"{topic}:message", f"{topic}: {wrong}")
         if command is not None:

@@ -203,7 +203,7 @@ class Sources:
         return estop.reset(self._rules.button, self._latch, now)[1]
 
     def expects(self, topic: str, message: Message) -> bool:
-        """Whether `hear` is for this message."""
+        """Whether `on_message` is for this message."""
         rules = self._rules
         if topic in rules.further:
             return isinstance(message, TwistStamped if rules.further[topic].stamped else Twist)
@@ -212,7 +212,7 @@ class Sources:
         listens = topic in rules.locks or (rules.button is not None and topic == rules.button_topic)
         return listens and isinstance(message, Bool)
 
-    def hear(self, topic: str, message: Message, now: float) -> tuple[Command | None, str]:
+    def on_message(self, topic: str, message: Message, now: float) -> tuple[Command | None, str]:
         """Take a message in. Never raises for what it holds.
 
         Returns:
@@ -225,9 +225,9 @@ class Sources:
             elif rules.button is not None:
                 self._latch = estop.on_button(rules.button, self._latch, bool(message.data), now)
         elif isinstance(message, Joy) and rules.joystick is not None:
-            return self._hear_joystick(rules.joystick, message, now)
+            return self._on_joystick(rules.joystick, message, now)
         elif isinstance(message, Twist | TwistStamped) and topic in rules.further:
-            return (None, "") if now < self._settled_at else self._hear_twist(rules.further[topic].name, message, now)
+            return (None, "") if now < self._settled_at else self._on_twist(rules.further[topic].name, message, now)
         return None, ""
 
     def admitted(self, command: Command, now: float) -> None:
@@ -238,7 +238,7 @@ class Sources:
             heard = restart_interlock.want(source.neutral, wanted, now, source.timeout_s, command.decided)
             self._sources[command.source] = replace(source, wanted=wanted, heard_at=now, neutral=heard)
 
-    def look(self, now: float, troubles: dict[str, str]) -> str:
+    def select(self, now: float, troubles: dict[str, str]) -> str:
         """Who drives now.
 
         Args:
@@ -339,7 +339,7 @@ class Sources:
             if source.priority < below:
                 self._sources[name] = replace(source, neutral=restart_interlock.require(why), started=False)
 
-    def _hear_joystick(self, params: JoystickParams, message: Joy, now: float) -> tuple[Command | None, str]:
+    def _on_joystick(self, params: JoystickParams, message: Joy, now: float) -> tuple[Command | None, str]:
         self._joystick, wrong = joystick.on_message(params, self._joystick, message, now)
         if self._joystick.grip is Grip.LOST:
             self._require("the joystick was lost", self._rules.joystick_priority)
@@ -349,7 +349,7 @@ class Sources:
         linear, angular = self._joystick.wanted
         return Command(Hand.JOYSTICK, linear, angular, 0, self._joystick_count, now, 0.0, now), wrong
 
-    def _hear_twist(self, name: str, message: Twist | TwistStamped, now: float) -> tuple[Command | None, str]:
+    def _on_twist(self, name: str, message: Twist | TwistStamped, now: float) -> tuple[Command | None, str]:
         source = self._sources[name]
         twist, stamp = (message, (0, 0)) if isinstance(message, Twist) else (message.twist, _stamp(message))
         if any(stamp):
