@@ -163,7 +163,7 @@ class Gate:
             if unknown := self._modes.select(message.data, now):
                 self._event("mode:message", f"{topic}: {unknown}")
         elif self._sources.expects(topic, message):
-            self._hear(topic, message, now)
+            self._on_source_message(topic, message, now)
         elif self._motion is not None and self._rules.odometry is not None and topic == self._rules.odometry.topic:
             if wrong_reading := self._motion.measure(message, now, wall):
                 self._event("odometry:message", f"{topic}: {wrong_reading}")
@@ -300,7 +300,7 @@ class Gate:
         """What share of a velocity an action leaves."""
         return {Action.STOP: 0.0, Action.SLOW: self._place.zones.slow(wanted), Action.FREE: 1.0}[action]
 
-    def _hear(self, topic: str, message: Message, now: float) -> None:
+    def _on_source_message(self, topic: str, message: Message, now: float) -> None:
         command, wrong = self._sources.on_message(topic, message, now)
         if wrong:
             self._event(f"{topic}:message", f"{topic}: {wrong}")
