@@ -152,7 +152,7 @@ class Gate:
             wall: The same by the clock that stamps are of [s]; nan: no sensor is known to use that (`StampRule.OWN`).
         """
         if topic in self._rules.sensors:
-            wrong = self._sensing.look(topic, message, now, wall)
+            wrong = self._sensing.on_message(topic, message, now, wall)
             if wrong is not None:
                 self._event(*wrong)
         elif topic in self._rules.contacts and isinstance(message, self._rules.contacts[topic].message):

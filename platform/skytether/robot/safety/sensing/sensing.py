@@ -140,7 +140,7 @@ class Sensing:
         self._tolerance = min(tolerance_s, _MOST_TOLERANCE_S)
         self._known: dict[str, _Known] = {}
 
-    def look(self, topic: str, message: Message, now: float, wall: float = nan) -> tuple[str, str] | None:
+    def on_message(self, topic: str, message: Message, now: float, wall: float = nan) -> tuple[str, str] | None:
         """Take a message of one of the sensors in. Never raises for what it holds. ``wall``: see `stamps.date`.
 
         Returns:
