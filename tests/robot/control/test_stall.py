@@ -170,17 +170,17 @@ def test_wheels_that_could_not_be_told_are_not_told_at_once_what_they_were_told_
 
 def test_the_watch_with_clocks_that_are_not_to_be_trusted():
     watch = StallWatch(0.1)
-    assert watch.look(10.0, 100.0) == 0
-    assert watch.look(10.01, 100.01) == 0
-    assert watch.look(10.02, 100.0) == 0, "interrupted between both clocks"
-    assert watch.look(10.03, 100.03) == 0
-    assert watch.look(nan, nan) == 0
-    assert watch.look(inf, 100.04) == 0
-    assert watch.look(10.05, None) == 0
-    assert watch.look(9.0, None) == 0, "back: the supervisor's clock check brakes"
-    assert watch.look(9.01, 109.01) == pytest.approx(10.01)
-    assert watch.look(9.02, 109.02) == 0, "named once"
-    assert watch.look(9.2, 109.2) == pytest.approx(0.18)
+    assert watch.tick(10.0, 100.0) == 0
+    assert watch.tick(10.01, 100.01) == 0
+    assert watch.tick(10.02, 100.0) == 0, "interrupted between both clocks"
+    assert watch.tick(10.03, 100.03) == 0
+    assert watch.tick(nan, nan) == 0
+    assert watch.tick(inf, 100.04) == 0
+    assert watch.tick(10.05, None) == 0
+    assert watch.tick(9.0, None) == 0, "back: the supervisor's clock check brakes"
+    assert watch.tick(9.01, 109.01) == pytest.approx(10.01)
+    assert watch.tick(9.02, 109.02) == 0, "named once"
+    assert watch.tick(9.2, 109.2) == pytest.approx(0.18)
 
 
 def test_both_clocks_of_this_machine_go_on():

@@ -6,6 +6,6 @@ import time
 
 
 def read_clocks() -> tuple[float, float | None]:
-    """Both clocks of this computer now, in the order of `skytether.robot.control.stall.StallWatch.look`."""
+    """Both clocks of this computer now, in the order of `skytether.robot.control.stall.StallWatch.tick`."""
     boot = time.clock_gettime(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else None
     return time.monotonic(), boot

@@ -235,7 +235,7 @@ class ControlLoop:
 
     def _look_for_stall(self, now: float, boot: float | None) -> None:
         """Whatever was known before a gap is old, and the wheels stand."""
-        stood = self._stall.look(now, boot)
+        stood = self._stall.tick(now, boot)
         if not stood:
             if now - self._written_at > self._limits.watchdog_s:  # nothing could be written: they stand as well
                 self._supervised = replace(self._supervised, velocity=STANDSTILL)

@@ -26,7 +26,7 @@ class StallWatch:
         self._last: float | None = None
         self._ahead = -inf
 
-    def look(self, now: float, boot: float | None = None) -> float:
+    def tick(self, now: float, boot: float | None = None) -> float:
         """A turn begins.
 
         Args:
