@@ -45,7 +45,7 @@ class FollowPath:
     def step(self, _velocity: Velocity, readings: Mapping[str, Reading], _dt: float) -> tuple[Velocity, float] | None:
         """Aim at the path's point ahead."""
         if not self._fixed:
-            self._look(readings.get(self._path))
+            self._update_track(readings.get(self._path))
         reading = readings.get(self._odom)
         if self._track is None or reading is None or not isinstance(reading.message, Odometry):
             return None
@@ -55,7 +55,7 @@ class FollowPath:
             return None
         return pursue(self._params, self._track, x, y, heading), reading.read_at
 
-    def _look(self, reading: Reading | None) -> None:
+    def _update_track(self, reading: Reading | None) -> None:
         """Take a new path; one that cannot be followed is none."""
         if reading is None or reading.message is self._known or not isinstance(reading.message, Path):
             return
