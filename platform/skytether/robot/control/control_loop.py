@@ -181,12 +181,12 @@ class ControlLoop:
         """
         self._seconds[self._choice.source] += max(0.0, now - self._now)
         try:
-            self._look_for_stall(now, boot)
+            self._check_stall(now, boot)
             # Time in which nobody could look proves no silence: what came meanwhile may wait in the socket still.
             self._quiet += min(max(0.0, now - self._now), _LOOKED_TICKS * self._limits.period_s)
-            self._take_readings(now)
-            self._take_told(now)
-            self._take_commands(now)
+            self._read_sensors(now)
+            self._read_back_velocity(now)
+            self._receive_commands(now)
             self._choose(now)
             velocity = self._drive(now)
             decided = self._decided(now)
@@ -233,7 +233,7 @@ class ControlLoop:
             stalls=self._stalls,
         )
 
-    def _look_for_stall(self, now: float, boot: float | None) -> None:
+    def _check_stall(self, now: float, boot: float | None) -> None:
         """Whatever was known before a gap is old, and the wheels stand."""
         stood = self._stall.tick(now, boot)
         if not stood:
@@ -250,7 +250,7 @@ class ControlLoop:
         sentence = f"the control loop stood still for {stood:.2f} s; the robot goes on from standstill"
         self._log_throttle.warn("stall", f"control: {sentence}", now)
 
-    def _take_readings(self, now: float) -> None:
+    def _read_sensors(self, now: float) -> None:
         for topic, message in self._hardware.read(now):
             self._read[topic] += 1
             if now < self._believed_from:
@@ -263,7 +263,7 @@ class ControlLoop:
                     except Exception as error:  # costs the cloud a reading; the robot's own control goes on
                         self._caught("publish", error)
 
-    def _take_told(self, now: float) -> None:
+    def _read_back_velocity(self, now: float) -> None:
         if self._tells_back is None:
             return
         self._told = self._tells_back.told(now)
@@ -301,14 +301,14 @@ class ControlLoop:
             return [before, coming] if before is not None else [coming]
         return [before] if before is not None else []
 
-    def _take_commands(self, now: float) -> None:
+    def _receive_commands(self, now: float) -> None:
         for session in self._change_over():
             self._missed_commands += session.take_missed()
             for epoch, message in session.take():
                 self._commands += 1
-                self._take(epoch, message, session.encoding, now)
+                self._receive_command(epoch, message, session.encoding, now)
 
-    def _take(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:
+    def _receive_command(self, epoch: int, message: MessageReceived, encoding: Encoding, now: float) -> None:
         try:
             command = _command(epoch, message, encoding)
         except DecodeError as error:
