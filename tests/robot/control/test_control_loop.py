@@ -544,7 +544,7 @@ def test_what_else_the_service_sends_is_not_a_command(rig, bridge):
     rig.connect(bridge)
     message = encode(Twist(linear=Vector3(x=0.2)), "cdr")
     rig.cloud.session.deliver(type("M", (), {"topic": "path", "payload": message})())
-    assert rig.cloud.session.take() == []
+    assert rig.cloud.session.drain_commands() == []
 
 
 class Watcher(Stop):

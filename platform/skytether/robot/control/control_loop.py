@@ -303,8 +303,8 @@ class ControlLoop:
 
     def _receive_commands(self, now: float) -> None:
         for session in self._change_over():
-            self._missed_commands += session.take_missed()
-            for epoch, message in session.take():
+            self._missed_commands += session.drain_missed()
+            for epoch, message in session.drain_commands():
                 self._commands += 1
                 self._receive_command(epoch, message, session.encoding, now)
 

@@ -116,14 +116,14 @@ class LiveSession:
         """Whether any wait to be taken."""
         return self.connected and bool(self._arrived)
 
-    def take(self) -> list[tuple[int, MessageReceived]]:
+    def drain_commands(self) -> list[tuple[int, MessageReceived]]:
         """What arrived since the last call, with the number of its handshake, oldest first."""
         taken = []
         while self._arrived:
             taken.append(self._arrived.popleft())
         return taken
 
-    def take_missed(self) -> int:
+    def drain_missed(self) -> int:
         """How many were too many to wait, since the last call."""
         new = self._missed - self._told_missed
         self._told_missed += new
