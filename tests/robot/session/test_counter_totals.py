@@ -23,42 +23,42 @@ def counted(tally: CounterTotals, topic: str = "scan") -> tuple[int, int, int, i
 
 def test_sessions_add_up_also_while_there_are_two():
     tally, first, second = CounterTotals("a"), Session(), Session()
-    tally.take(first, of(SCAN))
-    tally.take(second, of(SCAN))
+    tally.update(first, of(SCAN))
+    tally.update(second, of(SCAN))
     assert counted(tally) == (20, 14, 6, 2)
-    tally.take(first, of(replace(SCAN, sent=11, delivered=8)), last=True)
+    tally.update(first, of(replace(SCAN, sent=11, delivered=8)), last=True)
     assert counted(tally) == (21, 15, 6, 2)
-    tally.take(first, of(SCAN))  # somebody who looked at the same time
+    tally.update(first, of(SCAN))  # somebody who looked at the same time
     assert counted(tally) == (21, 15, 6, 2)
-    tally.take(second, of(replace(SCAN, sent=15, delivered=12)), last=True)
+    tally.update(second, of(replace(SCAN, sent=15, delivered=12)), last=True)
     assert counted(tally) == (26, 20, 6, 2)
 
 
 def test_nothing_goes_down():
     tally, session = CounterTotals("a"), Session()
-    tally.take(session, of(SCAN))
-    tally.take(session, of(replace(SCAN, lost=1, late=2, delivered=8)))  # a loss was late after all
+    tally.update(session, of(SCAN))
+    tally.update(session, of(replace(SCAN, lost=1, late=2, delivered=8)))  # a loss was late after all
     assert counted(tally) == (10, 8, 3, 2)
-    tally.take(session, of(SCAN))  # an older look
-    tally.take(session, of())  # the topic is gone
+    tally.update(session, of(SCAN))  # an older look
+    tally.update(session, of())  # the topic is gone
     assert counted(tally) == (10, 8, 3, 2)
-    tally.take(session, of(), last=True)
+    tally.update(session, of(), last=True)
     assert counted(tally) == (10, 8, 3, 2)
 
 
 def test_what_is_under_way_when_a_session_ends_is_unknown():
     tally, session = CounterTotals("a"), Session()
-    tally.take(session, of(replace(SCAN, sent=15)))
+    tally.update(session, of(replace(SCAN, sent=15)))
     assert tally.sums()["scan", "in"][1]["unknown"] == 0
-    tally.take(session, of(replace(SCAN, sent=15)), last=True)
+    tally.update(session, of(replace(SCAN, sent=15)), last=True)
     assert tally.sums()["scan", "in"][1]["unknown"] == 6  # of 15, 7 arrived and 2 are lost
 
 
 def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one():
     tally = CounterTotals("a")
-    tally.take(Session(), of(SCAN, TopicStats("old", "in", 5, sent=3)), last=True)
+    tally.update(Session(), of(SCAN, TopicStats("old", "in", 5, sent=3)), last=True)
     now = of(replace(SCAN, sent=2**60, delay_p50=0.02))
-    tally.take(Session(), now)
+    tally.update(Session(), now)
     told = report(None, tally, now, 0.1)
     scan, old = told.topics
     assert (told.life, scan.topic, scan.sent, scan.delivered, scan.delay_p50_s) == ("a", "scan", MOST_COUNTED, 14, 0.02)
@@ -67,7 +67,7 @@ def test_a_report_has_the_sums_of_all_sessions_and_the_delays_of_the_present_one
 
 def test_a_report_of_more_topics_than_it_may_have_names_those_of_the_present_session():
     tally, now = CounterTotals("a"), of(SCAN)
-    tally.take(Session(), of(*(TopicStats(str(n), "in", 5) for n in range(MOST_TOPICS))), last=True)
-    tally.take(Session(), now)
+    tally.update(Session(), of(*(TopicStats(str(n), "in", 5) for n in range(MOST_TOPICS))), last=True)
+    tally.update(Session(), now)
     told = report(None, tally, now, 0.1).topics
     assert (len(told), told[0].topic) == (MOST_TOPICS, "scan")

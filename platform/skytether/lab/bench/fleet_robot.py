@@ -167,7 +167,7 @@ class SimulatedRobot:
 
     def _report(self) -> Report:
         for link in self._links.values():
-            self._totals.take(link, link.sessions[Role.ROBOT].stats(self._now))
+            self._totals.update(link, link.sessions[Role.ROBOT].stats(self._now))
         return report(None, self._totals, None, 0.1)
 
     def _follow(self, instance: Instance) -> None:
@@ -195,7 +195,7 @@ class SimulatedRobot:
         link = self._links.pop(session)
         del self._instances[session]
         self._run(link, self._now + _DRAIN_S, traffic=False)
-        self._totals.take(link, link.sessions[Role.ROBOT].stats(link.now), last=True)
+        self._totals.update(link, link.sessions[Role.ROBOT].stats(link.now), last=True)
 
     def _end(self, role: Role, instance: Instance) -> Session:
         session = _session(instance)

@@ -345,7 +345,7 @@ class Agent:
     def _end(self, session: LiveSession) -> None:
         session.close()
         if session.bridge is not None:
-            self._totals.take(session, session.bridge.stats(), last=True)
+            self._totals.update(session, session.bridge.stats(), last=True)
 
     def _stay(self, instance: rest.Instance, reason: str) -> None:
         """What was to take over does not."""
@@ -386,7 +386,7 @@ class Agent:
         self._settle()
         for opened in list(self._open_sessions.values()):
             if opened.session.bridge is not None:
-                self._totals.take(opened.session, opened.session.bridge.stats())
+                self._totals.update(opened.session, opened.session.bridge.stats())
         session = self._control_loop.session
         if session is None or session.bridge is None:
             return

@@ -321,7 +321,7 @@ class _Replay:
         if self._bridge is None:
             return None
         stats = self._bridge.stats()
-        self._totals.take(self._bridge, stats)
+        self._totals.update(self._bridge, stats)
         return report(None, self._totals, stats, min((path.rtt for path in stats.paths), default=nan))
 
     def _wait_until_running(self) -> rest.Session:

@@ -41,7 +41,7 @@ class CounterTotals:
         self._ended: WeakSet[Hashable] = WeakSet()
         self._priorities: dict[Key, int] = {}
 
-    def take(self, session: Hashable, stats: SessionStats, *, last: bool = False) -> None:
+    def update(self, session: Hashable, stats: SessionStats, *, last: bool = False) -> None:
         """Note what a session has counted by now.
 
         Args:
