@@ -127,7 +127,7 @@ class HubSensors:
         self._node = Node(way.port)
         for name in topics.kinds:
             self._node.subscribe(resolve(name, way.namespace), partial(self._inbox.put, name))
-        self.stops, self.read, self.close = self._inbox.take_stops, self._inbox.take, self._node.close
+        self.stops, self.read, self.close = self._inbox.drain_stops, self._inbox.drain, self._node.close
 
 
 class HubWheels:

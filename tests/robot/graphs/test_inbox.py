@@ -43,10 +43,10 @@ def test_a_press_among_hundreds_of_scans_and_releases_is_kept(encoding):
     for i in range(300):
         box.put("scan", scan(float(i)))
         box.put("estop", Bool(data=False))
-    assert [(topic, message.data) for topic, message in box.inbox.take_stops()] == [("estop", True), ("estop", False)]
-    assert box.inbox.take_stops() == []
+    assert [(topic, message.data) for topic, message in box.inbox.drain_stops()] == [("estop", True), ("estop", False)]
+    assert box.inbox.drain_stops() == []
     # Of the scans, the newest.
-    assert [message.ranges[0] for _, message in box.inbox.take()] == [299.0]
+    assert [message.ranges[0] for _, message in box.inbox.drain()] == [299.0]
 
 
 @settings(max_examples=50, deadline=None)
@@ -55,7 +55,7 @@ def test_whatever_the_order_a_press_is_among_what_is_taken_and_the_newest_word_i
     box = Box()
     for topic, value in said:
         box.put(topic, Range(range=0.5 if value else 0.05) if topic == "cliff" else Bool(data=value))
-    taken = box.inbox.take_stops()
+    taken = box.inbox.drain_stops()
     for topic, is_stop in TOPICS.stops.items():
         words = [message for its, message in taken if its == topic]
         expected = [value if topic != "bumper" else not value for its, value in said if its == topic]
@@ -72,7 +72,7 @@ def test_a_joystick_is_not_pushed_out_by_scans():
         box.put("scan", scan(1.0))
     for i in range(30):
         box.put("joy", Joy(buttons=np.array([i], dtype=np.int32)))
-    taken = box.inbox.take()
+    taken = box.inbox.drain()
     assert [topic for topic, _ in taken] == ["scan"] + ["joy"] * 16
     assert taken[-1][1].buttons[0] == 29
 
@@ -82,8 +82,8 @@ def test_what_is_no_message_or_too_large_is_told_and_not_used():
     box.inbox.put("estop", b"\1")
     box.inbox.put("scan", b"\1\2\3")
     box.inbox.put("cloud", bytes((16 << 20) + 1))
-    assert box.inbox.take_stops() == []
-    assert box.inbox.take() == []
+    assert box.inbox.drain_stops() == []
+    assert box.inbox.drain() == []
     assert set(box.told) == {"sensors:estop:bytes", "sensors:scan:bytes", "sensors:cloud:bytes"}
 
 
@@ -100,9 +100,9 @@ def test_presses_from_many_threads_are_all_seen():
         thread.start()
     seen = []
     while any(thread.is_alive() for thread in threads):
-        seen.append(len(box.inbox.take_stops()))
+        seen.append(len(box.inbox.drain_stops()))
     for thread in threads:
         thread.join()
-    seen.append(len(box.inbox.take_stops()))
+    seen.append(len(box.inbox.drain_stops()))
     assert sum(seen) >= 1
     assert max(seen) <= 2, "of a topic its last press, and its last word"

@@ -68,13 +68,13 @@ class Inbox:
                 self._count += 1
                 self._waiting.setdefault(topic, deque(maxlen=room)).append((self._count, data))
 
-    def take_stops(self) -> list[tuple[str, Message]]:
+    def drain_stops(self) -> list[tuple[str, Message]]:
         """What was said of stops since the last call: of each topic its last press, and its last word."""
         with self._lock:
             stops, self._stops = self._stops, {}
         return [(topic, message) for topic, messages in stops.items() for message in messages]
 
-    def take(self) -> list[tuple[str, Message]]:
+    def drain(self) -> list[tuple[str, Message]]:
         """What else came since the last call, oldest first."""
         with self._lock:
             waiting, self._waiting = self._waiting, {}

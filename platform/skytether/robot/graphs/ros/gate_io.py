@@ -75,8 +75,8 @@ class RosSensors(RosGateNode[Node]):
 
     def stops(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what stops the robot."""
-        return self._inbox.take_stops()
+        return self._inbox.drain_stops()
 
     def read(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what else came since the last turn."""
-        return self._inbox.take()
+        return self._inbox.drain()

@@ -71,12 +71,12 @@ class SocketSensors:
     def stops(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what waits in the socket for stops, all of it."""
         self._fill(self._stops, _STOPS_EACH_TURN, stops=True)
-        return self._inbox.take_stops()
+        return self._inbox.drain_stops()
 
     def read(self) -> Iterable[tuple[str, Message]]:
         """Sensors: what waits in the socket for readings."""
         self._fill(self._readings, _EACH_TURN, stops=False)
-        return self._inbox.take()
+        return self._inbox.drain()
 
     def close(self) -> None:
         """Close the sockets."""
