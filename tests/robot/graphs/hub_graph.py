@@ -177,7 +177,7 @@ class Hub(GraphKind[HubSection, HubWay]):
         finally:
             node.close()
 
-    def look(self, section, config, folder, *, manifest, command_topic, role) -> list[Finding]:
+    def check(self, section, config, folder, *, manifest, command_topic, role) -> list[Finding]:
         return [Finding("hub", f"127.0.0.1:{section.port}", "", f"is looked at by the {role}")]
 
     def open_sensors(self, way, topics, trouble) -> HubSensors:

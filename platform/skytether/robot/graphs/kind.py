@@ -132,7 +132,7 @@ class GraphKind(ABC, Generic[Section, Way]):
         """
 
     @abstractmethod
-    def look(
+    def check(
         self,
         section: Section,
         config: RobotGraphConfig,

@@ -32,7 +32,7 @@ def check_run(settings: RobotConfig, folder: Path, token: str, role: str = "chec
         ConfigError: The graph cannot be joined.
     """
     manifest, findings = look_at_orchestrator(settings, token)
-    findings += settings.kind.look(
+    findings += settings.kind.check(
         settings.graph,
         settings.graph_config,
         folder,

@@ -53,7 +53,7 @@ class Ros1(GraphKind[Ros1Config, Ros1Way]):
         with join(section, config, ros, on_end) as robot:
             yield robot
 
-    def look(
+    def check(
         self,
         section: Ros1Config,
         config: RobotGraphConfig,

@@ -50,7 +50,7 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
         with join(section, config, folder, ros) as robot:
             yield robot
 
-    def look(
+    def check(
         self,
         section: Ros2Config,
         config: RobotGraphConfig,
