@@ -26,7 +26,7 @@ _DOCTORS = "ros master"
 _TODO = "start roscore, or correct ros1.master in robot.yaml (ROS_MASTER_URI); both machines must know each other"
 
 
-def look(
+def check_graph(
     section: Ros1Config, shared: RobotGraphConfig, manifest: Manifest | None, command_topic: str, role: str
 ) -> list[Finding]:
     """Everything that a run will need of the graph, one by one.
@@ -37,10 +37,10 @@ def look(
     graph = robot_config(section, shared)
     # With the agent's own name the master would end the agent that runs.
     with joined_node(section, node_name(section, graph.home, role), lambda _: None) as node:
-        return _look(graph, node, manifest, command_topic, graph.drivers or [node_name(section, graph.home)])
+        return _check_joined(graph, node, manifest, command_topic, graph.drivers or [node_name(section, graph.home)])
 
 
-def _look(
+def _check_joined(
     graph: Ros1RobotConfig, node: Node, manifest: Manifest | None, command_topic: str, own: Collection[str]
 ) -> list[Finding]:
     findings = [_master(node)]

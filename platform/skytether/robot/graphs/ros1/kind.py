@@ -63,9 +63,9 @@ class Ros1(GraphKind[Ros1Config, Ros1Way]):
         command_topic: str,
         role: str,
     ) -> list[Finding]:
-        from .check import look
+        from .check import check_graph
 
-        return look(section, config, manifest, command_topic, role)
+        return check_graph(section, config, manifest, command_topic, role)
 
     def arguments(self, section: Ros1Config, home: str, ros: RosArguments) -> RosArguments:
         from .join import private_parameters
