@@ -35,7 +35,7 @@ _NEXT_S = 5.0
 _TODO = "start the robot's nodes, or correct ros2 in robot.yaml"
 
 
-def look(
+def check_graph(
     ros2: Ros2Config, shared: RobotGraphConfig, folder: Path, manifest: Manifest | None, command_topic: str
 ) -> list[Finding]:
     """Everything that a run will need of the graph, one by one.

@@ -60,9 +60,9 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
         command_topic: str,
         role: str,  # noqa: ARG002 - two nodes of one name may be there
     ) -> list[Finding]:
-        from .check import look
+        from .check import check_graph
 
-        return look(section, config, folder, manifest, command_topic)
+        return check_graph(section, config, folder, manifest, command_topic)
 
     def extras(self, section: Ros2Config) -> list[str]:
         return ["ros2"] if section.dialect != "rclpy" else []
