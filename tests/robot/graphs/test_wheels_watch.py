@@ -29,16 +29,16 @@ def test_a_crowd_is_cut_off():
 def test_each_is_named_once_while_it_lasts_and_counted(caplog):
     found = [*OURS]
     watch = WheelsWatch("/cmd_vel", OURS, lambda: found, look_s=3600)
-    watch.look()
+    watch.poll()
     assert watch.others == Others((), 0)
     found.append("/teleop")
-    watch.look()
-    watch.look()
+    watch.poll()
+    watch.poll()
     assert watch.others == Others(("/teleop",), 1)
     found.remove("/teleop")
-    watch.look()
+    watch.poll()
     found.append("/teleop")
-    watch.look()
+    watch.poll()
     assert watch.others == Others(("/teleop",), 2)
     assert sum("/teleop publishes /cmd_vel too" in message for message in caplog.messages) == 2
     watch.close()
@@ -54,8 +54,8 @@ def test_a_graph_that_does_not_answer_tells_nothing_new():
         return answer
 
     watch = WheelsWatch("/cmd_vel", OURS, find, look_s=3600)
-    watch.look()
-    watch.look()
+    watch.poll()
+    watch.poll()
     assert watch.others == Others(("/teleop",), 1)
     watch.close()
 
@@ -65,12 +65,12 @@ def test_another_gate_of_our_configuration_is_named_and_a_killed_writer_is_not()
     found = [*OURS, OURS[0]]
     watch = WheelsWatch("/cmd_vel", OURS, lambda: found, look_s=3600)
     for _ in range(LEFT_BEHIND):
-        watch.look()
+        watch.poll()
     found.remove(OURS[0])
-    watch.look()
+    watch.poll()
     assert watch.others == Others((), 0)
     found.append(OURS[0])
     for _ in range(LEFT_BEHIND + 1):
-        watch.look()
+        watch.poll()
     assert watch.others == Others(("another /skytether_guard",), 1)
     watch.close()

@@ -72,7 +72,7 @@ class Doubles:
         self._own = own
         self._looks: dict[str, int] = {}
 
-    def look(self, found: Collection[str]) -> tuple[str, ...]:
+    def poll(self, found: Collection[str]) -> tuple[str, ...]:
         """Names, in words, of those that are there twice for longer than one that was killed is shown."""
         counts = Counter(found)
         self._looks = {name: self._looks.get(name, 0) + 1 for name in self._own if counts[name] > 1}
@@ -102,14 +102,14 @@ class WheelsWatch:
         self._thread = threading.Thread(target=self._run, name="wheels-watch", daemon=True)
         self._thread.start()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Once."""
         try:
             found = self._find()
         except Exception as error:  # a graph that does not answer tells nothing new
             _log.debug("who publishes %s is not known now", self._topic, exc_info=error)
             return
-        names = (*strangers(found, self._own), *self._doubles.look(found))
+        names = (*strangers(found, self._own), *self._doubles.poll(found))
         new = [name for name in names if name not in self.others.names]
         for name in new:
             _log.error("%s", sentence(self._topic, [name]))
@@ -123,7 +123,7 @@ class WheelsWatch:
 
     def _run(self) -> None:
         while not self._ended.wait(self._look_s):
-            self.look()
+            self.poll()
 
 
 def sentence(topic: str, names: Collection[str]) -> str:
