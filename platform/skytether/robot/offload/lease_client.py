@@ -184,7 +184,7 @@ class LeaseClient:
         request = wanted.request
         if request is None:
             self.release()
-            return self._say("", _IDLE_S)
+            return self._set_trouble("", _IDLE_S)
         held = self._instance
         try:
             instance = self._with_key(self._exchange(request))
@@ -192,7 +192,7 @@ class LeaseClient:
             self._let_go(error.instance)
             return self._lost(str(error))
         except Unreachable as error:
-            return self._say(str(error), self._backoff.next())
+            return self._set_trouble(str(error), self._backoff.next())
         except ApiError as error:
             return self._refused(error, request.service)
         if instance.state.final or instance.state is State.STOPPING:
@@ -227,7 +227,7 @@ class LeaseClient:
                 delay = turn()
             except Exception as error:  # a robot must not stop asking because of one strange answer
                 _log.debug("asking failed", exc_info=error)
-                delay = self._say(f"asking failed unexpectedly: {error!r}", self._backoff.next())
+                delay = self._set_trouble(f"asking failed unexpectedly: {error!r}", self._backoff.next())
             if self._trouble and self._trouble != told:
                 _log.warning("%s", self._trouble)
             told = self._trouble
@@ -337,16 +337,16 @@ class LeaseClient:
         if status == 404 and self._instance is not None:
             return self._lost(f"instance {self._instance.id} is gone; asking for {service} again")
         if status == 403 or (status == 401 and not self._another_token()):
-            return self._say(str(error), _REFUSED_S)
-        return self._say(str(error), self._backoff.next())
+            return self._set_trouble(str(error), _REFUSED_S)
+        return self._set_trouble(str(error), self._backoff.next())
 
     def _lost(self, sentence: str) -> float:
         """The instance has ended; one that is coming is followed, otherwise another is asked for."""
         self._instance, self._next = (self._next[0] if self._next else None), None
         self._key = str(uuid.uuid4())
-        return self._say(sentence, self._backoff.next())
+        return self._set_trouble(sentence, self._backoff.next())
 
-    def _say(self, sentence: str, delay: float) -> float:
+    def _set_trouble(self, sentence: str, delay: float) -> float:
         self._trouble = sentence[:_LONGEST]
         return delay
 
