@@ -261,7 +261,7 @@ def decide(
     if here is None:
         # Offloaded to wherever the orchestrator liked best. Sites that nobody measured are no reason to choose.
         known = any(isfinite(site.quality.rtt) for site in sites)
-        return _take(best, options, "", now) if known else standing
+        return _choose(best, options, "", now) if known else standing
     if best is here:
         return standing
     began = before.challenger[1] if before.challenger and before.challenger[0].site == best.site else now
@@ -275,7 +275,7 @@ def decide(
         return standing
     if now - began < due:
         return OffloadDecision(before.offload, before.site, before.why, before.since, options, (best, began))
-    return _take(best, options, why, now)
+    return _choose(best, options, why, now)
 
 
 def weigh(policy: Policy, needs: Needs, sites: Sequence[SiteView], robot: RobotView) -> list[Option]:
@@ -286,7 +286,7 @@ def weigh(policy: Policy, needs: Needs, sites: Sequence[SiteView], robot: RobotV
     return options or [Option(None, refused="no site is known, and mode is offload")]
 
 
-def _take(option: Option, options: tuple[Option, ...], why: str, now: float) -> OffloadDecision:
+def _choose(option: Option, options: tuple[Option, ...], why: str, now: float) -> OffloadDecision:
     verb = "local" if option.site is None else "offload"
     others = "; ".join(o.describe() for o in options if o is not option)
     line = f"{verb}: {option.describe()}"
