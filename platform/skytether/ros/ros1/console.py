@@ -46,7 +46,7 @@ class Console:
     def __init__(self, node: Node, root: str = "skytether", clock: Callable[[], float] = time.time) -> None:
         self._node = node
         self._publication = node.advertise(ROSOUT, _LOG, hash_of(_LOG, "ros1"), queue=_QUEUE, hold_s=_HOLD_S)
-        self._tap = LogTap(root, self._say)
+        self._tap = LogTap(root, self._publish)
         self._root = self._tap.root
         self._clock = clock
         self._sequence = 0
@@ -66,7 +66,7 @@ class Console:
             self._node.unserve(server)
         self._node.unadvertise(self._publication)
 
-    def _say(self, record: logging.LogRecord, text: str) -> None:
+    def _publish(self, record: logging.LogRecord, text: str) -> None:
         self._sequence += 1
         seconds, rest = divmod(self._clock(), 1)
         stamp = {"sec": int(seconds), "nanosec": int(rest * 1e9)}
