@@ -47,7 +47,7 @@ class Console:
         self._node = node
         self._name = name.strip("/").replace("/", ".")
         self._clock = clock
-        self._tap = LogTap(root, self._say)
+        self._tap = LogTap(root, self._enqueue)
         self._level = logging.INFO
         qos = Qos(transient_local=True, depth=KEPT)
         self._publication = node.publish(Endpoint(Kind.PUBLISHER, ROSOUT, LOG, hash_of(LOG, "cdr"), qos))
@@ -69,7 +69,7 @@ class Console:
         self._changed.set()
         self._thread.join()  # the publication ends with the node: what still waits in it would be lost
 
-    def _say(self, record: logging.LogRecord, text: str) -> None:
+    def _enqueue(self, record: logging.LogRecord, text: str) -> None:
         if record.thread == self._thread.ident:
             return  # of publishing itself: that would go round and round
         seconds, rest = divmod(self._clock(), 1)
