@@ -79,14 +79,16 @@ def test_a_real_bag_played_at_the_robot_arrives_identical_in_the_service_s_graph
         wait_for(
             lambda: (
                 {"/listener"} < set(service.subscribers("/scan"))
-                and listener.look()["/scan"][0]
+                and listener.publishers_by_topic()["/scan"][0]
                 and len(pair.service_port.subscribers("scan")) == 2
             ),
             "listener and recorder",
         )
         player = robot.start("rosbag", "play", "-r", "4", "-u", str(PLAYED_S), "--wait-for-subscribers", str(bag))
         assert player.wait(60) == 0
-        wait_for(lambda: not pair.robot_node.look()[topic][0], "the player to be gone, its last message read")
+        wait_for(
+            lambda: not pair.robot_node.publishers_by_topic()[topic][0], "the player to be gone, its last message read"
+        )
         wait_for(lambda: taken and len(heard) == len(taken), "everything that was sent")
         assert heard == taken
         assert in_order(taken, recorded)

@@ -72,7 +72,7 @@ def test_a_real_publisher_is_heard_whether_it_comes_before_or_after_and_when_it_
         numbers = [int(text) for text in texts(heard)]
         assert numbers == list(range(len(numbers)))
         graph.end(talker)
-        wait_for(lambda: not node.look()["/chat"][0], "the talker to be gone")
+        wait_for(lambda: not node.publishers_by_topic()["/chat"][0], "the talker to be gone")
         heard.messages.clear()
     assert [info.caller for info in heard.publishers] == ["/first", "/second"]
     assert {(info.type, info.md5, info.latched) for info in heard.publishers} == {("std_msgs/String", MD5, False)}
@@ -124,8 +124,8 @@ def test_another_type_is_refused_on_both_sides_with_both_sums_named_once(graph, 
     bool_md5 = "8b94c1b53db61fb6aed406028ad6332a"
     node.subscribe("/chat", "std_msgs/msg/Bool", bool_md5, heard.listener)
     graph.python(TALKER, "talker", "/chat", "often")
-    wait_for(lambda: node.look()["/chat"][1], "the refusal")
-    (refusal,) = node.look()["/chat"][1].values()
+    wait_for(lambda: node.publishers_by_topic()["/chat"][1], "the refusal")
+    (refusal,) = node.publishers_by_topic()["/chat"][1].values()
     assert all(part in refusal for part in ("/chat", "/talker", "std_msgs/String", MD5, "std_msgs/Bool", bool_md5))
     ours = node.advertise("/ours", "std_msgs/msg/Bool", bool_md5)
     graph.python(LISTENER, "listener", "/ours")

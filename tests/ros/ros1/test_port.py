@@ -57,7 +57,9 @@ def test_topics_are_found_under_the_namespaces_of_their_sources_both_ways(make_p
     talker, listener = other(robot), other(service)
     heard = hear(listener, "/walker/chat", STRING, MD5)
     ours = talker.advertise("/walker/chat", STRING, MD5, queue=1000)
-    wait_for(lambda: "/skytether" in ours.subscribers and listener.look()["/walker/chat"][0], "both ends")
+    wait_for(
+        lambda: "/skytether" in ours.subscribers and listener.publishers_by_topic()["/walker/chat"][0], "both ends"
+    )
     sent = [string(str(n)) for n in range(500)]
     for data in sent:
         ours.publish(data)
@@ -66,7 +68,9 @@ def test_topics_are_found_under_the_namespaces_of_their_sources_both_ways(make_p
 
     back = hear(talker, "/navigation/answer", STRING, MD5)
     theirs = listener.advertise("/navigation/answer", STRING, MD5)
-    wait_for(lambda: theirs.subscribers and talker.look()["/navigation/answer"][0], "both ends of the answer")
+    wait_for(
+        lambda: theirs.subscribers and talker.publishers_by_topic()["/navigation/answer"][0], "both ends of the answer"
+    )
     theirs.publish(string("hello"))
     wait_for(lambda: back == [string("hello")], "the answer")
 
@@ -146,7 +150,7 @@ def test_a_type_that_only_the_graph_knows_is_carried_with_its_definition(make_pa
 
     wait_for(talk, "the message")
     assert heard[0] == b"\x01\x02\x03\x04"
-    (info,) = listener.look()["/walker/chat"][0].values()
+    (info,) = listener.publishers_by_topic()["/walker/chat"][0].values()
     assert (info.type, info.md5, info.definition) == ("my_msgs/Own", md5, definition)
 
 

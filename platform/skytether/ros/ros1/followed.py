@@ -17,7 +17,7 @@ def taken(
         name: In the bridge.
         graph: In the graph.
         kind: Its type.
-        seen: What `Node.look` says.
+        seen: What `Node.publishers_by_topic` says.
     """
     connected, refused = seen.get(graph, ({}, {}))
     nodes = tuple(sorted(info.caller for info in connected.values()))

@@ -315,7 +315,7 @@ class Node:
             return False
         return True
 
-    def look(self) -> Mapping[str, tuple[Mapping[str, Any], Mapping[str, str]]]:
+    def publishers_by_topic(self) -> Mapping[str, tuple[Mapping[str, Any], Mapping[str, str]]]:
         """By topic that the node takes: publishers that are connected, and refusals; both by address."""
         with self._lock:
             entries = list(self._subscriptions.values())
@@ -344,7 +344,7 @@ class Node:
     def connections(self) -> list[list[Any]]:
         with self._lock:
             publications = [e.publication for e in self._publications.values()]
-        taken = [(topic, uri) for topic, (connected, _) in self.look().items() for uri in connected]
+        taken = [(topic, uri) for topic, (connected, _) in self.publishers_by_topic().items() for uri in connected]
         given = [(p.topic, caller) for p in publications for caller in p.subscribers]
         rows = [(uri, "i", topic) for topic, uri in taken] + [(caller, "o", topic) for topic, caller in given]
         return [[i, who, way, "TCPROS", topic, True] for i, (who, way, topic) in enumerate(rows)]

@@ -185,7 +185,7 @@ class Ros1Port:
 
     def topics(self) -> list[Followed]:
         """How each topic stands in the graph now; those that the other end gives are there once agreed."""
-        seen = self._node.look()
+        seen = self._node.publishers_by_topic()
         found = []
         for row in self._sends:
             name = self._names.of(row.name)

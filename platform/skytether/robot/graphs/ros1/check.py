@@ -81,7 +81,7 @@ def _topics(
     published = node.master.published()
     deadline = time.monotonic() + _LOOK_S
     awaited = {name for _, name in taken} & set(published)
-    while time.monotonic() < deadline and any(not any(node.look()[name]) for name in awaited):
+    while time.monotonic() < deadline and any(not any(node.publishers_by_topic()[name]) for name in awaited):
         time.sleep(0.05)
     for row in rows:
         name = names.of(row.name)
@@ -107,7 +107,7 @@ def _any(graph: Ros1RobotConfig, node: Node) -> list[Finding]:
 
 
 def _incoming(row: TopicSpec, name: str, node: Node, published: bool) -> Finding:
-    connected, refused = node.look()[name]
+    connected, refused = node.publishers_by_topic()[name]
     if refused:
         return Finding(row.name, name, row.type, next(iter(refused.values())), good=False)
     if connected:

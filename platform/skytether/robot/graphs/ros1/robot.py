@@ -100,7 +100,7 @@ class Ros1Robot(RosRobot):
         """How the service's topics, and the robot's own, stand in the graph now; from any thread."""
         found = [] if self._port is None else self._port.topics()
         known = {(topic.graph, topic.way) for topic in found}
-        names, seen = self._config.names(()), self._node.look()
+        names, seen = self._config.names(()), self._node.publishers_by_topic()
         own = [taken(name, names.own(name), kind, seen) for name, kind in self._config.readings.items()]
         if self._wheels is not None and self._config.cmd_vel is not None:
             listeners = tuple(self._wheels.subscribers)
