@@ -149,9 +149,9 @@ class Ros1Port:
         elif message.topic == NOTES[self._other]:
             told = graph_notes.unpack(message.payload)
             if told is None:
-                self._say("the other end told nothing about its graph that is understood here")
+                self._log_once("the other end told nothing about its graph that is understood here")
             else:
-                self._take_notes(told)
+                self._receive_notes(told)
         elif message.topic in self._early:
             self._early[message.topic].append(message.payload)
 
@@ -217,7 +217,7 @@ class Ros1Port:
             try:
                 self._peer.publish(topic.name, merge(data) if merge else data)
             except (KeyError, ValueError) as error:
-                self._say(str(error))
+                self._log_once(str(error))
 
         listener = Listener(on_message, partial(self._on_publisher, topic))
         self._ends.append(self._node.subscribe(name, topic.type, self._md5(topic), listener))
@@ -225,7 +225,7 @@ class Ros1Port:
     def _on_publisher(self, topic: Topic, info: PublisherInfo) -> None:
         """In the node's thread: learn the type if it is not known everywhere."""
         if info.latched and not topic.latched and topic.type != _STATUS:
-            self._say(
+            self._log_once(
                 f"topic {topic.name} is latched by {info.caller}, but not in the manifest: who comes late at the other "
                 "end does not get it; write reliable: true, latched: true there"
             )
@@ -257,7 +257,7 @@ class Ros1Port:
                     name, topic.type, md5, definition, latched=topic.latched, queue=queue, hold_s=hold
                 )
             except (GraphNameError, ValueError) as error:
-                self._say(f"topic {topic.name} cannot be published here: {error}")
+                self._log_once(f"topic {topic.name} cannot be published here: {error}")
                 return
             for payload in self._early.pop(topic.name, ()):
                 publication.publish(payload)
@@ -301,7 +301,7 @@ class Ros1Port:
                     name, kind, lambda request: self._peer.call(call, request, timeout)
                 )
             except (GraphNameError, ValueError) as error:
-                self._say(f"service {call} cannot be offered here: {error}")
+                self._log_once(f"service {call} cannot be offered here: {error}")
 
     def _unserve(self, call: str) -> None:
         with self._lock:
@@ -322,7 +322,7 @@ class Ros1Port:
 
     # --- notes -----------------------------------------------------------------------------------------------------
 
-    def _take_notes(self, told: Notes) -> None:
+    def _receive_notes(self, told: Notes) -> None:
         """In the bridge's thread: the other end's graph has changed."""
         self._others = told
         for name in list(self._early):
@@ -334,7 +334,7 @@ class Ros1Port:
                 self._unserve(call)
             elif ros1_type(note.type) != self._service_type(call):
                 self._unserve(call)
-                self._say(
+                self._log_once(
                     f"service {call}: the other end has {note.type} with MD5 {note.md5}, but "
                     f"{self._service_type(call)} is wanted; it is left out"
                 )
@@ -373,7 +373,7 @@ class Ros1Port:
             try:
                 found[name] = self._node.master.get_param(name)
             except RefusedError:
-                self._say(f"parameter {name} is not set, so it is not handed over")
+                self._log_once(f"parameter {name} is not set, so it is not handed over")
         return found
 
     def _find_services(self) -> None:
@@ -389,7 +389,7 @@ class Ros1Port:
                 name = self._names.of(call)
                 found = self._node.find_service(name) if self._may(Access.CALL, name) else None
             except CallRefusedError as error:
-                self._say(str(error))
+                self._log_once(str(error))
                 found = None
             if found is None:
                 self._found.pop(call, None)
@@ -400,10 +400,10 @@ class Ros1Port:
         """Whether the other end may do that here; a refusal is named."""
         refusal = self._permissions.refusal(access, name) if self._permissions is not None else ""
         if refusal:
-            self._say(refusal)
+            self._log_once(refusal)
         return not refusal
 
-    def _say(self, sentence: str) -> None:
+    def _log_once(self, sentence: str) -> None:
         """Each once."""
         if sentence not in self._said and len(self._said) < 1000:
             self._said.add(sentence)
