@@ -157,7 +157,7 @@ class Ros2Port:
     def deliver(self, message: MessageReceived) -> None:
         """Port: publish what came from the peer."""
         if message.topic in NOTES.values():
-            self._take_notes(graph_notes.unpack(message.payload) or Notes())
+            self._receive_notes(graph_notes.unpack(message.payload) or Notes())
             return
         way = self._ways.get(message.topic)
         if way is not None and message.topic in self._late:
@@ -265,7 +265,7 @@ class Ros2Port:
 
     # --- notes -------------------------------------------------------------------------------------------------------
 
-    def _take_notes(self, told: Notes) -> None:
+    def _receive_notes(self, told: Notes) -> None:
         """In the bridge's thread: the peer knows types that it did not know when the session began."""
         for name, note in told.types.items():
             row = self._late.pop(name, None)
