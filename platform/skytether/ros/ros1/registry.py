@@ -106,10 +106,10 @@ class Registry:
             wrong = self._settle()
         except MasterError as error:
             self.present = False
-            self._say("", f"no ROS master answers: {error}; waiting for it")
+            self._log_once("", f"no ROS master answers: {error}; waiting for it")
             return
         for name, nonsense in wrong.items():
-            self._say(name, f"the ROS master answers nonsense for {name}: {nonsense}; it is asked again")
+            self._log_once(name, f"the ROS master answers nonsense for {name}: {nonsense}; it is asked again")
         if self._said and not wrong:
             _log.warning("the ROS master at %s answers", self._master.uri)
             self._said.clear()
@@ -124,14 +124,14 @@ class Registry:
             self._master.knows(self._node)  # whether it is there at all
         wrong: dict[str, NonsenseError] = {}
         for entry in surplus:
-            if self._tell(entry.unregister, entry.name, wrong):
+            if self._call_master(entry.unregister, entry.name, wrong):
                 self._done.remove(entry)
         for entry in missing:
-            if self._tell(entry.register, entry.name, wrong):
+            if self._call_master(entry.register, entry.name, wrong):
                 self._done.append(entry)
         return wrong
 
-    def _tell(self, tell: Callable[[Master], None], name: str, wrong: dict[str, NonsenseError]) -> bool:
+    def _call_master(self, tell: Callable[[Master], None], name: str, wrong: dict[str, NonsenseError]) -> bool:
         """Whether the master has heard it, be it that it refuses."""
         try:
             tell(self._master)
@@ -157,7 +157,7 @@ class Registry:
         self._dirty = True
         self._changed.notify_all()
 
-    def _say(self, about: str, sentence: str) -> None:
+    def _log_once(self, about: str, sentence: str) -> None:
         """Once for each name, and for the master, until all is well again."""
         if about not in self._said:
             _log.warning("%s", sentence)
