@@ -108,7 +108,7 @@ class Subscription:
         named = list(dict.fromkeys(uri for uri in uris if uri != self._own_uri))
         named.sort(key=lambda uri: uri not in self._following)  # whom it follows already it goes on to follow
         if len(named) > _MOST_PUBLISHERS:
-            self._say(f"topic {self.topic} has more than {_MOST_PUBLISHERS} publishers; the others are left out")
+            self._log_once(f"topic {self.topic} has more than {_MOST_PUBLISHERS} publishers; the others are left out")
         self._listed = set(named[:_MOST_PUBLISHERS])
         for uri in self._listed - set(self._following):
             self._following[uri] = asyncio.ensure_future(self._follow(uri))
@@ -190,7 +190,7 @@ class Subscription:
                 f"MD5 {self.md5 or 'unknown here'} is wanted; it is left out"
             )
             self.refusals[uri] = refusal
-            self._say(refusal)
+            self._log_once(refusal)
             return None
         self.refusals.pop(uri, None)
         if not self.md5 and info.md5 != ANY:
@@ -204,14 +204,16 @@ class Subscription:
         while True:
             frame = await read_frame(reader)
             if isinstance(frame, int):
-                self._say(f"topic {self.topic}: a message of {frame} bytes is too large for a session; it is left out")
+                self._log_once(
+                    f"topic {self.topic}: a message of {frame} bytes is too large for a session; it is left out"
+                )
                 continue
             if info.latched and (uri in self._latched or len(self._latched) < _KEPT_LATCHED):
                 self._latched[uri] = frame
             for listener in self.listeners:
                 listener.on_message(frame, info)
 
-    def _say(self, sentence: str) -> None:
+    def _log_once(self, sentence: str) -> None:
         """Each once."""
         if sentence not in self._said and len(self._said) < _KEPT_LATCHED:
             self._said.add(sentence)
