@@ -162,7 +162,7 @@ class Subscription(Handle):
 
     def __init__(self, host: Host, endpoint: Endpoint, take: Callable[[bytes], object]) -> None:
         super().__init__(host, endpoint)
-        self._take = take
+        self._on_message = take
 
     def _declare(self, session: zenoh.Session) -> list[Any]:
         key, qos = self._host.dialect.key(self.endpoint), self.endpoint.qos
@@ -187,7 +187,7 @@ class Subscription(Handle):
             return
         self.passed += 1
         try:
-            self._take(sample.payload.to_bytes())
+            self._on_message(sample.payload.to_bytes())
         except Exception:  # Zenoh's thread must live on
             _log.exception("A message of %s was lost", self.endpoint.name)
 

@@ -80,7 +80,7 @@ class Handle:
         """The program is gone."""
         self._sender = None
 
-    def take(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         """In the node's thread: a frame of this channel came."""
 
     def review(self, others: Collection[Endpoint]) -> None:
@@ -161,7 +161,7 @@ class Publication(Handle):
             self._waiting.append((number, now))
             return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
 
-    def take(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         number, unread_s, published = pull_dealt_with(frame.body)
         with self._lock:
             self._unread = (_now(), unread_s)
@@ -219,7 +219,7 @@ class Subscription(Handle):
         lose: Callable[[int], object] | None = None,
     ) -> None:
         super().__init__(host, channel, endpoint)
-        self._take = take
+        self._on_message = take
         self._lose = lose
         self._lost = 0
         self._overrun = Overrun(endpoint.qos.depth)
@@ -252,13 +252,13 @@ class Subscription(Handle):
             )
         )
 
-    def take(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         if self.refused:
             self.dropped += 1
             return
         self.passed += 1
         try:
-            self._take(frame.body)
+            self._on_message(frame.body)
         except Exception:  # the node's thread must live on
             _log.exception("A message of %s was lost", self.endpoint.name)
 
@@ -289,7 +289,7 @@ class Server(Handle):
         sender.put(control(do="serve", channel=self.channel, name=ours.name, kind=ours.type, priority=ours.priority))
         super().join(sender)
 
-    def take(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         number, request = pull_number(frame.body)
         if self.refused:
             self._fail(number, self.refused)
@@ -361,7 +361,7 @@ class Client(Handle):
         for answer in waiting.values():
             answer.set_exception(CallError(f"{self.endpoint.name}: the ROS 2 graph was lost"))
 
-    def take(self, frame: Frame) -> None:
+    def on_frame(self, frame: Frame) -> None:
         number, body = pull_number(frame.body)
         with self._lock:
             answer = self._waiting.pop(number, None)

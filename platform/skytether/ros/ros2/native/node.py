@@ -263,7 +263,7 @@ class RclpyNode(NodeBase):
         if frame.kind is not FrameKind.CONTROL:
             handle = self._handles.get(frame.channel)
             if handle is not None:
-                handle.take(frame)
+                handle.on_frame(frame)
             return
         told = json.loads(frame.body)
         match told["what"]:
