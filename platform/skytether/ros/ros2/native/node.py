@@ -226,7 +226,7 @@ class RclpyNode(NodeBase):
                 self.report("alone", f"ROS 2 graph ({self.middleware}, domain {self.domain}): {NOBODY}")
             elif self.nodes:
                 self.settle("alone")
-            self._look_at_queues(time.monotonic())
+            self._check_queues(time.monotonic())
             if silent >= 10:
                 silent, self._hung = 0, True
                 with self._lock:
@@ -247,7 +247,7 @@ class RclpyNode(NodeBase):
             with link.makefile("rb", buffering=_BUFFER) as stream:
                 while (frame := pull_frame(stream)) is not None:
                     self._heard += 1
-                    self._take(frame)
+                    self._on_frame(frame)
         except OSError:
             pass
         finally:
@@ -259,7 +259,7 @@ class RclpyNode(NodeBase):
                     handle.leave()
             sender.close()
 
-    def _take(self, frame: Frame) -> None:
+    def _on_frame(self, frame: Frame) -> None:
         if frame.kind is not FrameKind.CONTROL:
             handle = self._handles.get(frame.channel)
             if handle is not None:
@@ -278,7 +278,7 @@ class RclpyNode(NodeBase):
             case "definition":
                 self._definitions[told["kind"]] = told["text"]
             case "graph":
-                self._look(told)
+                self._update_graph(told)
                 self._joined.set()
 
     def _trouble(self, channel: int, why: str) -> None:
@@ -288,7 +288,7 @@ class RclpyNode(NodeBase):
 
     # --- the graph ---------------------------------------------------------------------------------------------------
 
-    def _look(self, told: dict[str, Any]) -> None:
+    def _update_graph(self, told: dict[str, Any]) -> None:
         """The graph is another."""
         self.nodes, self.sim_time, self.log_level = told["nodes"], told["sim_time"], told["log_level"]
         known = {str(row[0]): _endpoint(row) for row in told["endpoints"]}
@@ -332,7 +332,7 @@ class RclpyNode(NodeBase):
         self._lost[handle.channel] = dropped + lost
         handle.lose(new)
 
-    def _look_at_queues(self, now: float) -> None:
+    def _check_queues(self, now: float) -> None:
         with self._lock:
             subscriptions = [handle for handle in self._handles.values() if isinstance(handle, Subscription)]
         for handle in subscriptions:
