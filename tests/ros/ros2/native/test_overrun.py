@@ -48,7 +48,7 @@ def test_where_only_the_newest_waits_one_that_gives_way_now_and_then_is_not_told
     found = {1: [], 5: []}
     for second in range(21):
         for watched, depth in ((newest, 1), (queue, 5)):
-            found[depth].append(watched.look(100 * second, 10 * second, 50.0 + second))
+            found[depth].append(watched.update(100 * second, 10 * second, 50.0 + second))
     assert set(found[1]) == {""}
     assert found[5][: int(WINDOW_S)] == [""] * int(WINDOW_S)
     assert found[5][int(WINDOW_S) :] == ["50 of 550 were dropped in 5 s, for 5 at most may wait"] * 16
@@ -56,15 +56,15 @@ def test_where_only_the_newest_waits_one_that_gives_way_now_and_then_is_not_told
 
 def test_it_is_over_after_a_while_without_any_and_told_anew_after_that():
     watched = Overrun(1)
-    assert watched.look(0, 0, 0.0) == ""
-    assert watched.look(10, 30, 1.0) == ""
+    assert watched.update(0, 0, 0.0) == ""
+    assert watched.update(10, 30, 1.0) == ""
     told = "30 of 40 were dropped in 5 s, for 1 at most may wait"
-    assert watched.look(10, 30, 5.0) == told
-    assert watched.look(500, 31, 20.0) == told
-    assert watched.look(600, 31, 20.0 + QUIET_S) == told
-    assert watched.look(700, 31, 21.0 + QUIET_S) == ""
-    assert watched.look(800, 32, 25.0 + QUIET_S) == ""
-    assert watched.look(803, 60, 31.0 + QUIET_S) == "29 of 132 were dropped in 10 s, for 1 at most may wait"
+    assert watched.update(10, 30, 5.0) == told
+    assert watched.update(500, 31, 20.0) == told
+    assert watched.update(600, 31, 20.0 + QUIET_S) == told
+    assert watched.update(700, 31, 21.0 + QUIET_S) == ""
+    assert watched.update(800, 32, 25.0 + QUIET_S) == ""
+    assert watched.update(803, 60, 31.0 + QUIET_S) == "29 of 132 were dropped in 10 s, for 1 at most may wait"
 
 
 @pytest.mark.slow

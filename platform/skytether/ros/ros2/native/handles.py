@@ -270,7 +270,7 @@ class Subscription(Handle):
 
     def overrun(self, now: float) -> str:
         """A sentence if messages come quicker than they are taken; empty if not, or not any more. ``now`` in s."""
-        found = self._overrun.look(self.passed, self._lost, now)
+        found = self._overrun.update(self.passed, self._lost, now)
         name = self.endpoint.name
         how = "publish them less often, or give the topic's row more depth"
         return f"{name}: messages come quicker than they are taken: {found}; {how}" if found else ""

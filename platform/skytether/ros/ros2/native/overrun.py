@@ -28,7 +28,7 @@ class Overrun:
         self._dropped = 0
         self._at = 0.0
 
-    def look(self, taken: int, dropped: int, now: float) -> str:
+    def update(self, taken: int, dropped: int, now: float) -> str:
         """See how it stands now.
 
         Args:
