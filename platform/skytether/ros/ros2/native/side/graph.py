@@ -25,7 +25,7 @@ def profile(reliable: bool, transient_local: bool, depth: int) -> QoSProfile:
     )
 
 
-def look(node: Any, names: list[str] | None) -> list[list[Any]]:
+def list_endpoints(node: Any, names: list[str] | None) -> list[list[Any]]:
     """Endpoints of other nodes, sorted.
 
     Each is a list: its id, which is another after it was away; kind; name; type; type hash or nothing; node; reliable;
@@ -49,8 +49,8 @@ def look(node: Any, names: list[str] | None) -> list[list[Any]]:
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
-def look_at_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]:
-    """Services that other nodes offer, and clients of ours, as `look` tells endpoints.
+def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]:
+    """Services that other nodes offer, and clients of ours, as `list_endpoints` does endpoints.
 
     Their nodes and the hashes of their types are there where the middleware tells them.
 

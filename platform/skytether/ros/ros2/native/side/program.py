@@ -390,11 +390,11 @@ class Program:
         if whole or self._awaits_names():
             served = {self._names.get(channel, "") for channel in list(self._servers)}
             asked = {self._names.get(channel, "") for channel in list(self._clients)}
-            self._all = graph.look(self._node, None) + graph.look_at_services(self._node, served, asked)
+            self._all = graph.list_endpoints(self._node, None) + graph.list_services(self._node, served, asked)
         else:
             services = [e for e in self._all if e[1] in (graph.SERVER, graph.CLIENT)]
             rest = [e for e in self._all if e not in services and e[2] not in wanted]
-            self._all = rest + services + graph.look(self._node, sorted(wanted))
+            self._all = rest + services + graph.list_endpoints(self._node, sorted(wanted))
         known = self._known(sorted(self._all, key=lambda e: str(e[0])))
         endpoints = [[*e[:2], wanted.get(e[2], e[2]), *e[3:]] for e in known]
         nodes, same = graph.others(self._node)
