@@ -129,7 +129,7 @@ class Program:
         self._lost: dict[int, int] = {}
         self._all: list[list[Any]] = []
         self._unnamed: dict[str, float] = {}
-        self._say(
+        self._send(
             what="ready",
             rmw=get_rmw_implementation_identifier(),
             domain=os.environ.get("ROS_DOMAIN_ID", "0"),
@@ -151,7 +151,7 @@ class Program:
             except ExternalShutdownException:
                 break
             except Exception as error:  # one bad message or request must not end the node
-                self._say(what="trouble", channel=0, why=f"{type(error).__name__}: {error}")
+                self._send(what="trouble", channel=0, why=f"{type(error).__name__}: {error}")
         code = 0 if self._ended.is_set() else SHUT_DOWN
         self._leave()
         return code
@@ -176,7 +176,7 @@ class Program:
         infos = self._node.get_publishers_info_by_topic(self._publishers[channel].topic_name)
         return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
 
-    def _say(self, **what: Any) -> None:
+    def _send(self, **what: Any) -> None:
         self._sender.put(control(**what))
 
     # --- from the agent ----------------------------------------------------------------------------------------------
@@ -193,9 +193,9 @@ class Program:
             try:
                 self._do(frame)
             except types.NotInstalledError as error:
-                self._say(what="trouble", channel=frame.channel, why=str(error))
+                self._send(what="trouble", channel=frame.channel, why=str(error))
             except Exception as error:
-                self._say(what="trouble", channel=frame.channel, why=f"{type(error).__name__}: {error}")
+                self._send(what="trouble", channel=frame.channel, why=f"{type(error).__name__}: {error}")
 
     def _do(self, frame: Frame) -> None:
         if frame.kind is Kind.DATA:
@@ -216,7 +216,7 @@ class Program:
             try:
                 getattr(self, f"_do_{what.pop('do')}")(**what)
             except types.NotInstalledError as error:
-                self._say(what="trouble", channel=what.get("channel", 0), why=str(error))
+                self._send(what="trouble", channel=what.get("channel", 0), why=str(error))
         elif frame.kind is Kind.REQUEST:
             self._call(frame.channel, *pull_number(frame.body))
         elif frame.channel in self._servers:
@@ -325,13 +325,13 @@ class Program:
     def _do_define(self, kind: str) -> None:
         """Tell a type's definition: from a thread, for reading files must hold no velocity up."""
 
-        def tell() -> None:
+        def send() -> None:
             text = ""  # of a type that is not here; whoever subscribes says so
             with contextlib.suppress(Exception):
                 text = definitions.definition(kind)
-            self._say(what="definition", kind=kind, text=text)
+            self._send(what="definition", kind=kind, text=text)
 
-        threading.Thread(target=tell, daemon=True).start()
+        threading.Thread(target=send, daemon=True).start()
 
     def _do_forget(self, channel: int, number: int) -> None:
         future = self._pending.pop((channel, number), None)
@@ -374,7 +374,7 @@ class Program:
         turn = 0
         while not self._ended.wait(LOOK_S if turn else 0.0):
             try:
-                news = self._look(whole=turn % EVERY == 0)
+                news = self._poll_graph(whole=turn % EVERY == 0)
             except Exception as error:
                 if self._ended.is_set() or not rclpy.ok():
                     return
@@ -385,7 +385,7 @@ class Program:
                 told = text
                 self._sender.put(control(**news), GRAPH)
 
-    def _look(self, *, whole: bool) -> dict[str, Any]:
+    def _poll_graph(self, *, whole: bool) -> dict[str, Any]:
         wanted = {self._node.resolve_topic_name(name): name for name in list(self._names.values())}
         if whole or self._awaits_names():
             served = {self._names.get(channel, "") for channel in list(self._servers)}
