@@ -184,10 +184,10 @@ class Ros2Node(NodeBase):
         watch = live.declare_subscriber(self.dialect.watched, on_token, history=True)
         try:
             patience = chain(_LOOK_S, repeat(_LOOK_S[-1]))
-            whole = self._look_at_all(session, next(patience))
+            whole = self._query_graph(session, next(patience))
             while not self._closing.is_set():
-                self._look_at_router(session)
-                changed = self._take_changes(graph)
+                self._check_router(session)
+                changed = self._apply_changes(graph)
                 with self._lock:
                     self._handles = [h for h in self._handles if not h.closed]
                     wanted = list(self._handles)
@@ -201,7 +201,7 @@ class Ros2Node(NodeBase):
                         number = numbers.setdefault(handle, len(numbers) + 1)
                         declared[handle] = self._declare(session, ours, number, handle)
                 if not whole:
-                    whole = self._look_at_all(session, next(patience))
+                    whole = self._query_graph(session, next(patience))
                     continue
                 self._joined.set()
                 self._wake.wait(_POLL_S)
@@ -212,7 +212,7 @@ class Ros2Node(NodeBase):
             watch.undeclare()  # type: ignore[no-untyped-call]
             token.undeclare()  # type: ignore[no-untyped-call]
 
-    def _look_at_all(self, session: zenoh.Session, patience_s: float) -> bool:
+    def _query_graph(self, session: zenoh.Session, patience_s: float) -> bool:
         """Ask for the graph; whether the answer is whole: who has joined knows all of it.
 
         The router tells each endpoint once: in this answer, or before it to the subscription.
@@ -230,7 +230,7 @@ class Ros2Node(NodeBase):
         token = self.dialect.token(ours, number, self._name, handle.endpoint)
         return [*handle.declare(session, token), session.liveliness().declare_token(token)]
 
-    def _take_changes(self, graph: Graph) -> bool:
+    def _apply_changes(self, graph: Graph) -> bool:
         """Whether the graph is another than before."""
         changed = False
         while self._changes:
@@ -252,7 +252,7 @@ class Ros2Node(NodeBase):
         handle.endpoint = replace(ours, type_hash=learned_hash(ours, others))
         return handle.endpoint.type_hash != ""
 
-    def _look_at_router(self, session: zenoh.Session) -> None:
+    def _check_router(self, session: zenoh.Session) -> None:
         info = session.info
         if info.routers_zid() or info.peers_zid():
             self._troubles.settle("router", f"the ROS 2 graph's router ({self._router}) is there now")
