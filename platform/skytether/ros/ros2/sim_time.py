@@ -38,7 +38,7 @@ class GraphClock:
             return self._clock()
         if self._handle is None:
             endpoint = Endpoint(Kind.SUBSCRIPTION, TOPIC, TYPE, hash_of(TYPE, "cdr"), Qos(reliable=False, depth=1))
-            self._handle = self._node.subscribe(endpoint, self._take)
+            self._handle = self._node.subscribe(endpoint, self._on_clock)
         return self._told
 
     def close(self) -> None:
@@ -46,7 +46,7 @@ class GraphClock:
         if self._handle is not None:
             self._handle.close()
 
-    def _take(self, payload: bytes) -> None:
+    def _on_clock(self, payload: bytes) -> None:
         try:
             told = decode_plain(TYPE, payload).clock
         except DecodeError as error:
