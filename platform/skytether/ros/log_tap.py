@@ -21,7 +21,7 @@ class LogTap(logging.Handler):
         super().__init__()
         self.root = logging.getLogger(root)
         """All others are below."""
-        self._say = say
+        self._on_record = say
         self._level_before = self.root.level
 
     def __enter__(self) -> Self:
@@ -42,6 +42,6 @@ class LogTap(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Handler: give it on."""
         try:
-            self._say(record, self.format(record))
+            self._on_record(record, self.format(record))
         except Exception:
             self.handleError(record)

@@ -69,7 +69,7 @@ class Translated:
     ) -> None:
         self._port = port
         self._own = own
-        self._say = say
+        self._report = say
         self._bridge: _Caller
         self._said: set[tuple[str, str]] = set()
         self._ways = {t.name: _Way(early=_early(t)) for t in topics}
@@ -134,7 +134,7 @@ class Translated:
                 way.convert = converter(topic.type, source, target)
             except NoConversionError as error:
                 way.refusal = f"{topic.name}: {error}"
-                self._say_once(topic.name, "type", way.refusal)
+                self._report_once(topic.name, "type", way.refusal)
         early, way.early = way.early, None
         for payload in early or ():
             self.publish(topic.name, payload)
@@ -147,7 +147,7 @@ class Translated:
         try:
             return way.convert(payload) if way.convert is not None else None
         except DecodeError as error:
-            self._say_once(topic, "bytes", f"{topic}: a message was dropped, more may have been: {error}")
+            self._report_once(topic, "bytes", f"{topic}: a message was dropped, more may have been: {error}")
             return None
 
     def _exchange(self, name: str, request: bytes, ask: Callable[[bytes], bytes]) -> bytes:
@@ -160,10 +160,10 @@ class Translated:
         except DecodeError as error:
             raise CallError(f"{name}: {error}") from error
 
-    def _say_once(self, topic: str, kind: str, sentence: str) -> None:
+    def _report_once(self, topic: str, kind: str, sentence: str) -> None:
         if (topic, kind) not in self._said:
             self._said.add((topic, kind))
-            self._say(sentence)
+            self._report(sentence)
 
 
 def _early(topic: Topic) -> deque[bytes] | None:

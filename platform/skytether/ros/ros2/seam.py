@@ -174,7 +174,7 @@ class Troubles:
     """
 
     def __init__(self, say: Callable[[str], object] | None = None) -> None:
-        self._say = say or _log.warning
+        self._report = say or _log.warning
         self._lock = threading.Lock()
         self._said: dict[str, str] = {}
 
@@ -184,14 +184,14 @@ class Troubles:
             if key in self._said or len(self._said) >= MAX_SAID:
                 return
             self._said[key] = text
-        self._say(text)
+        self._report(text)
 
     def settle(self, key: str, text: str = "") -> None:
         """A trouble is over, if there was one; ``text`` says so."""
         with self._lock:
             known = self._said.pop(key, None)
         if known is not None and text:
-            self._say(text)
+            self._report(text)
 
     def keep(self, name: str, sentences: Iterable[str]) -> None:
         """These are all that is wrong with a name of the graph."""
