@@ -32,14 +32,14 @@ class ActionlibServer(ActionServer[G, R, F]):
     def tick(self, now: float) -> None:
         super().tick(now)
         if self._send_results() or now >= self._next_status:
-            self._tell()
+            self._publish_status()
 
     def due(self) -> float:
         return self._next_status
 
     def on_goal(self, message: Any) -> None:
         """A client's ActionGoal."""
-        self._take_goal(message.goal_id, message.goal)
+        self._receive_goal(message.goal_id, message.goal)
 
     def on_cancel(self, which: GoalID) -> None:
         """A client's GoalID: an empty id without a time means all; else the one of that id, and all up to then.
@@ -56,10 +56,10 @@ class ActionlibServer(ActionServer[G, R, F]):
             unseen.state, unseen.ended_at = State.RECALLING, self.now
             self.goals[which.id] = unseen
         self._last_cancel = max(self._last_cancel, stamp)
-        self._tell()
+        self._publish_status()
 
     def accepted(self, goal: Goal[G, R, F]) -> None:  # noqa: ARG002 - all goals are told of
-        self._tell()
+        self._publish_status()
 
     def publish_feedback(self, goal: Goal[G, R, F], feedback: F) -> bool:
         cls = self.action.wrappers["ActionFeedback"]
@@ -72,9 +72,9 @@ class ActionlibServer(ActionServer[G, R, F]):
             self._results.popleft()[0].ended_at = self.now
         self._results.append((goal, cls(Header(self.unix_time), _status(goal), result)))
         self._send_results()
-        self._tell()
+        self._publish_status()
 
-    def _take_goal(self, goal_id: GoalID, message: G) -> None:
+    def _receive_goal(self, goal_id: GoalID, message: G) -> None:
         known = self.goals.get(goal_id.id)
         if known is not None:
             if known.state is State.RECALLING:
@@ -91,7 +91,7 @@ class ActionlibServer(ActionServer[G, R, F]):
             goal.cancel(text=_CALLED_OFF)
         else:
             self._offer(goal)
-            self._tell()
+            self._publish_status()
 
     def _send_results(self) -> bool:
         """Whether there were any that somebody takes."""
@@ -100,7 +100,7 @@ class ActionlibServer(ActionServer[G, R, F]):
             self._results.popleft()[0].ended_at = self.now
         return len(self._results) < waiting
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         self._forget(STATUS_KEEP)
         self._next_status = self.now + STATUS_PERIOD
         self.send("status", ActionlibGoalStatusArray(Header(self.unix_time), [*map(_status, self.goals.values())]))
