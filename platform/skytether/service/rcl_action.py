@@ -47,7 +47,7 @@ class RclActionServer(ActionServer[G, R, F]):
         if self._forget(RESULT_KEEP):
             self._results = {i: result for i, result in self._results.items() if i in self.goals}
             self._untold = True
-        self._tell()
+        self._publish_status()
 
     def due(self) -> float:
         return min((g.ended_at + RESULT_KEEP for g in self.goals.values() if g.ended_at is not None), default=np.inf)
@@ -81,7 +81,7 @@ class RclActionServer(ActionServer[G, R, F]):
             candidates = [g for g in self.goals.values() if g.id == which or _order(g.stamp) <= up_to]
             meant = [goal for goal in candidates if self._ask_to_cancel(goal)]
         self._untold = self._untold or bool(meant)
-        self._tell()
+        self._publish_status()
         return CancelGoalResponse(_NONE, [_info(goal) for goal in meant])
 
     def on_get_result(self, request: Any) -> Future[Any]:
@@ -121,9 +121,9 @@ class RclActionServer(ActionServer[G, R, F]):
 
     def _changed(self) -> None:
         self._untold = True
-        self._tell()
+        self._publish_status()
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         """The newest of this topic is kept for whoever comes later, so it is sent only when it changes."""
         if self._untold:
             told = [GoalStatus(_info(goal), CODES[goal.state]) for goal in self.goals.values()]
