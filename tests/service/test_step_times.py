@@ -52,7 +52,7 @@ def test_it_is_told_again_when_it_has_changed() -> None:
 def test_it_is_in_the_file_of_reports_and_neither_loses_the_other(tmp_path: Path) -> None:
     reports = Reports()
     reports.path = tmp_path / "reports.json"
-    reports.tell_steps(0.0042)
+    reports.report_step_time(0.0042)
     reports.add("lost", "why")
     document = json.loads(reports.path.read_bytes())
     assert pull_step_s(document) == 0.0042

@@ -146,12 +146,12 @@ def _serve(cls: type[Service[Any]], grant: Grant) -> int:
 def _teller(service: Service[Any], clock: SystemClock, times: StepTimes | None) -> Callable[[], None]:
     """What tells how long steps take, where that is wanted."""
 
-    def tell() -> None:
+    def report() -> None:
         news = None if times is None else times.news(clock.now())
         if news is not None:
-            service.reports.tell_steps(news)
+            service.reports.report_step_time(news)
 
-    return tell
+    return report
 
 
 def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant, tell: Callable[[], None]) -> int:

@@ -39,7 +39,7 @@ class Reports:
             if self.path is not None:
                 self._write(self.path)
 
-    def tell_steps(self, step_s: float) -> None:
+    def report_step_time(self, step_s: float) -> None:
         """Say how long steps take; from any thread."""
         with self._lock:
             self._step_s = step_s
