@@ -31,10 +31,10 @@ from .ros_graph import (
     Setting,
     argument,
     guarding,
+    receive_from,
     ros_environment,
     run,
     spaces_of,
-    take_from,
     with_setup,
 )
 from .ros_guard import CORE, RosGuard
@@ -58,8 +58,8 @@ class _Graph:
         self.port = Ros1Port(node, Role.SERVICE, setting.names, setting.table, on_notes=self._notes.put)
         self.command = ("roslaunch", *arguments)
 
-    def take_notes(self, timeout: float) -> bool:
-        return take_from(self._notes, timeout, lambda told: _set_params(self._node, told.params))
+    def receive_notes(self, timeout: float) -> bool:
+        return receive_from(self._notes, timeout, lambda told: _set_params(self._node, told.params))
 
 
 @contextmanager

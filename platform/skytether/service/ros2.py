@@ -96,7 +96,7 @@ class _Graph:
         except ValueError as error:
             raise ConfigError(f"the manifest of {setting.grant.service} does not fit ROS 2: {error}") from None
 
-    def take_notes(self, timeout: float) -> bool:
+    def receive_notes(self, timeout: float) -> bool:
         """ROS 2 keeps no parameters beside its nodes, so a robot of it hands none over."""
         time.sleep(timeout)
         return False

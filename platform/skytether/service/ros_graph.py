@@ -110,7 +110,7 @@ class RosGraph(Protocol):
         """The same, to be run."""
         ...
 
-    def take_notes(self, timeout: float) -> bool:
+    def receive_notes(self, timeout: float) -> bool:
         """Wait so many seconds for what the robot tells of its graph, and use it; whether it came."""
         ...
 
@@ -209,7 +209,7 @@ def _work(grant: Grant, graph: RosGraph, joined: _Joined, *, wait_s: float) -> i
     while True:
         if grant.ready_file is not None:
             touch(grant.ready_file, 0.0)  # for the health check: this loop is alive
-        told = graph.take_notes(POLL_S)
+        told = graph.receive_notes(POLL_S)
         now = time.monotonic()
         since = joined.connected_at
         if since is not None:
@@ -226,8 +226,8 @@ def _work(grant: Grant, graph: RosGraph, joined: _Joined, *, wait_s: float) -> i
             raise ServiceError(f"{ended}; see the lines above")
 
 
-def take_from(notes: queue.SimpleQueue[Notes], timeout: float, use: Callable[[Notes], object]) -> bool:
-    """`RosGraph.take_notes` for what comes in a queue."""
+def receive_from(notes: queue.SimpleQueue[Notes], timeout: float, use: Callable[[Notes], object]) -> bool:
+    """`RosGraph.receive_notes` for what comes in a queue."""
     try:
         told = notes.get(timeout=timeout)
     except queue.Empty:
