@@ -35,7 +35,7 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
     """
     keys = [0, 0]
 
-    def look(value: Any, depth: int, listed: bool) -> _Odd | None:
+    def check(value: Any, depth: int, listed: bool) -> _Odd | None:
         """Where a request holds a hundred numbers: no place is written down before something is wrong there."""
         inner: Iterable[tuple[Any, Any]]
         if isinstance(value, dict):
@@ -52,13 +52,13 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
             trouble = _of_text(key) if isinstance(key, str) else None
             if trouble is not None:
                 return [], f"one of its keys {trouble}"
-            odd = look(one, depth + 1, listed)
+            odd = check(one, depth + 1, listed)
             if odd is not None:
                 odd[0].append(str(key))
                 return odd
         return None
 
-    odd = look(document, 0, False)
+    odd = check(document, 0, False)
     if odd is not None:
         place, trouble = odd[0][::-1], odd[1]
         return Fault(".".join(place if len(place) < DEPTH else place[:3]), trouble)
@@ -72,11 +72,11 @@ def oddity(document: Any, text: bytes = b"") -> Fault | None:
 def _doubled(text: bytes) -> Fault | None:
     twice: list[str] = []
 
-    def look(pairs: list[tuple[str, Any]]) -> None:
+    def note_doubled(pairs: list[tuple[str, Any]]) -> None:
         counts = Counter(key for key, _ in pairs)
         twice.extend(key for key, count in counts.items() if count > 1)
 
-    json.loads(text, object_pairs_hook=look)
+    json.loads(text, object_pairs_hook=note_doubled)
     if not twice:
         return None
     key = twice[0][:40].encode(errors="backslashreplace").decode()  # it may be in what was dropped, and so anything
