@@ -51,7 +51,7 @@ class FaceMesh:
         self._input = self._network.get_input_details()[0]["index"]
         self._points, self._score = (output["index"] for output in self._network.get_output_details())
 
-    def look(self, image: Image.Image, box: Box) -> Landmarks:
+    def detect(self, image: Image.Image, box: Box) -> Landmarks:
         """Points of the face in a box of an RGB picture."""
         scale = _ROOM * max(box.width, box.height) / _SIDE
         along, across = scale * math.cos(box.tilt), scale * math.sin(box.tilt)

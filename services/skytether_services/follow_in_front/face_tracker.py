@@ -88,7 +88,7 @@ class FaceTracker:
             self._known, self._size = [], image.size
         found: list[_Known] = []
         for known in self._known:
-            _take(found, self._follow(image, known))
+            _add(found, self._follow(image, known))
         if not found or self._pictures % _SEARCH_EVERY == 0:
             self._search(image, found)
         self._pictures += 1
@@ -103,7 +103,7 @@ class FaceTracker:
             for box in self._detector.find(image, part):
                 if left and len(found) < _MOST and not any(_same(box, one.box) for one in found):
                     left -= 1
-                    _take(found, self._look_twice(image, box))
+                    _add(found, self._detect_twice(image, box))
             if found:
                 break
 
@@ -117,24 +117,24 @@ class FaceTracker:
             return None
         near = min(self._detector.find(image, part), key=lambda one: _moved(one, box), default=None)
         if near is None:
-            found = self._look(image, box)
+            found = self._detect(image, box)
             return _Known(found, None) if found is not None and _moved(found.box(), box) <= _STILL else None
         before = known.detected
         if before is not None:
             expected = box._replace(x=box.x + near.x - before.x, y=box.y + near.y - before.y)
-            found = self._look(image, expected)
+            found = self._detect(image, expected)
             if found is not None and _moved(found.box(), expected) <= _STILL:
                 return _Known(found, near)
-        return self._look_twice(image, near)
+        return self._detect_twice(image, near)
 
-    def _look_twice(self, image: Image.Image, box: Box) -> _Known | None:
+    def _detect_twice(self, image: Image.Image, box: Box) -> _Known | None:
         """A face that was detected in a box: boxes of a detector are not those of the landmarks."""
-        first = self._look(image, box)
-        found = self._look(image, first.box()) if first is not None else None
+        first = self._detect(image, box)
+        found = self._detect(image, first.box()) if first is not None else None
         return _Known(found, box) if found is not None and _moved(found.box(), box) <= _MOVED_DETECTED else None
 
-    def _look(self, image: Image.Image, box: Box) -> Landmarks | None:
-        found = self._mesh.look(image, box)
+    def _detect(self, image: Image.Image, box: Box) -> Landmarks | None:
+        found = self._mesh.detect(image, box)
         now = found.box()
         return found if found.score >= _LEAST_SCORE and max(now.width, now.height) >= _SMALLEST else None
 
@@ -157,7 +157,7 @@ class FaceTracker:
         return Face(turned(found.points) - bearing, bearing, max(box.width, box.height), found.score)
 
 
-def _take(found: list[_Known], new: _Known | None) -> None:
+def _add(found: list[_Known], new: _Known | None) -> None:
     if new is not None and len(found) < _MOST and not any(_same(new.box, one.box) for one in found):
         found.append(new)
 

@@ -35,7 +35,7 @@ def main(photograph: Path, folder: Path) -> None:
     image = Image.open(photograph).convert("RGB")
     mesh, box = FaceMesh(), FaceDetector().find(image)[0]
     for _ in range(5):  # settles
-        found = mesh.look(image, box)
+        found = mesh.detect(image, box)
         box = found.box()
     flat = _with_rings(found.points)
     low, high = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)

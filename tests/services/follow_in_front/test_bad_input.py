@@ -144,14 +144,14 @@ def test_a_wall_of_portraits_takes_no_longer_than_a_few_faces(monkeypatch: pytes
         for y in range(0, 400, 95):
             wall.paste(head, (x, y))
     tracker, looked = FaceTracker(1.08), 0
-    look = FaceMesh.look
+    look = FaceMesh.detect
 
     def counted(*args: Any) -> Any:
         nonlocal looked
         looked += 1
         return look(*args)
 
-    monkeypatch.setattr(FaceMesh, "look", counted)
+    monkeypatch.setattr(FaceMesh, "detect", counted)
     for _ in range(6):
         looked = 0
         assert len(tracker.step(np.asarray(wall))) <= 3
