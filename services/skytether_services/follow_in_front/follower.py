@@ -185,11 +185,11 @@ class Follower:
         for scan, came in waiting:
             robot = self._track.pose_at(scan.stamp)
             if robot is not None:
-                self._take_scan(scan, robot)
+                self._track_operator(scan, robot)
             elif now - came <= _WAITS:
                 self._waiting.append((scan, came))
 
-    def _take_scan(self, scan: Scan, robot: Pose) -> None:
+    def _track_operator(self, scan: Scan, robot: Pose) -> None:
         """Find the operator in a scan; where the robot was is known."""
         if scan.at <= self._scan_at:
             return

@@ -69,9 +69,9 @@ class FollowInFront(Service[Params]):
         if self._commands.due(now):
             velocity = self._follower.step(now, self._delay.seconds, max(self._errors.values()))
             self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
-            self._tell(self._follower.report, now)
+            self._publish_report(self._follower.report, now)
         # After the command, which is of this moment: a picture takes some milliseconds, or a stalled machine seconds.
-        self._take_picture(now)
+        self._receive_picture(now)
 
     def _listen(self, now: float) -> None:
         """Hand what the robot measured on, but for pictures."""
@@ -90,16 +90,16 @@ class FollowInFront(Service[Params]):
             self._follower.odometry(message.header.stamp.seconds(), pose, odom.made_at, now)
         if scan := self.scan.take():
             self._errors["scan"] = scan.sent_at_error
-            self._take_scan(scan, now)
+            self._receive_scan(scan, now)
 
-    def _take_picture(self, now: float) -> None:
+    def _receive_picture(self, now: float) -> None:
         """Look at a picture, if one came and is due."""
         if (picture := self.picture.take()) and now - self._looked_at >= _EARLY / self.params.face_rate:
             self._looked_at = now
             self._errors["picture"] = picture.sent_at_error
             self._follower.picture(picture.message.data.tobytes(), picture.made_at, now)
 
-    def _take_scan(self, received: Received[LaserScan], now: float) -> None:
+    def _receive_scan(self, received: Received[LaserScan], now: float) -> None:
         scan, laser = received.message, self.params.laser
         found = self._frames.lookup(self._base_frame, scan.header.frame_id) if laser is None else (laser.pose, 0.0)
         self._follower.laser_unknown = found is None
@@ -109,7 +109,7 @@ class FollowInFront(Service[Params]):
         stamp, at = scan.header.stamp.seconds(), received.made_at
         self._follower.scan(Scan(stamp, at, scan.ranges, scan.angle_min, scan.angle_increment, limits, found[0]), now)
 
-    def _tell(self, report: Report, now: float) -> None:
+    def _publish_report(self, report: Report, now: float) -> None:
         if self._lasting.due(report.code, now, _LASTS):
             self.report(report.code, report.message)
         if report.code != self._told or self._tells.due(now):
