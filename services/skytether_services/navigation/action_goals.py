@@ -96,7 +96,7 @@ class ActionGoals:
             navigator.cancel()
             self._end("cancel", 0, _CALLED_OFF)
 
-    def tell(self, navigator: Navigator, now: float, stamp: float) -> None:
+    def update_client(self, navigator: Navigator, now: float, stamp: float) -> None:
         """Tell the client how its goal goes, or has ended; after the navigator's step.
 
         Args:

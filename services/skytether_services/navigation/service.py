@@ -149,7 +149,7 @@ class Navigation(Service[Params]):
         velocity = self.navigator.step(now, self._delay.seconds)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
         self._tell(now)
-        self._clients.tell(self.navigator, now, self._stamp)
+        self._clients.update_client(self.navigator, now, self._stamp)
 
     @answers(Trigger)
     def cancel(self, request: TriggerRequest) -> TriggerResponse:
