@@ -149,13 +149,13 @@ class Mppi(PathController):
         weighted_mean(self._controls, self._total, params.temperature, self._planned)
         self._smooth(velocity, bounds)
         command = Velocity(float(self._planned[0, 0]), float(self._planned[1, 0]))
-        trajectory, collides = self._look(start, bounds, costmap)
+        trajectory, collides = self._predict(start, bounds, costmap)
         if collides:
             # The mean of ways around both sides may lead between them: then the best one, as it is.
             best = int(self._total.argmin())
             self._planned[:] = self._controls[:, best]
             command = Velocity(float(self._planned[0, 0]), float(self._planned[1, 0]))
-            trajectory, _ = self._look(start, bounds, costmap)
+            trajectory, _ = self._predict(start, bounds, costmap)
         self._before = np.column_stack((self._before[:, 1:], np.array(command)))
         return Control(command, ControlStatus.DRIVING, trajectory)
 
@@ -245,7 +245,7 @@ class Mppi(PathController):
             change = most * self._params.step
             row[0] = min(max(row[0], speed - change), speed + change)
 
-    def _look(
+    def _predict(
         self, start: NDArray[np.float64], bounds: NDArray[np.float64], costmap: Costmap
     ) -> tuple[NDArray[np.float64], bool]:
         """Where the plan leads, and whether it collides."""
