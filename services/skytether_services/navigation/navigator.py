@@ -414,10 +414,10 @@ class Navigator:
         self._progress.reset()
         self._planned_at = -math.inf
 
-    def hear(self, now: float, said: Sequence[Said]) -> None:
+    def receive(self, now: float, said: Sequence[Said]) -> None:
         """Other robots of the group said something (`neighbours`)."""
         if self.surroundings is not None:
-            self.surroundings.neighbours.hear(now, said)
+            self.surroundings.neighbours.receive(now, said)
 
     def word(self, now: float) -> str | None:
         """What to tell them; None: there are none, or this robot does not know where it is."""

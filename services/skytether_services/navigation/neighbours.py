@@ -116,7 +116,7 @@ class Neighbours:
         heard = {robot: "heard" for robot, one in self._heard.items() if now - one.at <= _LISTENING}
         return {**heard, **{robot: str(why) for robot, (at, why) in self._unheard.items() if now - at <= _LISTENING}}
 
-    def hear(self, now: float, said: Sequence[Said]) -> None:
+    def receive(self, now: float, said: Sequence[Said]) -> None:
         """Take what the others said, for `read`; while something waits to be read, nothing more is taken."""
         if now - self._heard_at < _LEAST:
             return
@@ -148,7 +148,7 @@ class Neighbours:
             self._heard = {robot: self._heard[robot] for robot in newest if now - self._heard[robot].at <= lasts}
         return bool(self._waiting)
 
-    def look(self, now: float, pose: Pose, scan: Scan) -> None:
+    def observe(self, now: float, pose: Pose, scan: Scan) -> None:
         """Note what this robot's own laser sees: what it can tell, and what of the others' word is not so."""
         if self._away is None or not self.is_listening(now):
             return

@@ -144,7 +144,7 @@ class Navigation(Service[Params]):
         if heard := self.obstacles_shared.take():
             late = max(0.0, heard.age(now))
             said = [replace(one, age=one.age + late) for one in read_said(heard.message.data)]
-            self.navigator.hear(now, said)
+            self.navigator.receive(now, said)
         self._clients.listen(self.navigator, now)
         velocity = self.navigator.step(now, self._delay.seconds)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))

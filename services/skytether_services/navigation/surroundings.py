@@ -97,7 +97,7 @@ class Surroundings:
             sighting: A new scan.
         """
         if sighting is not None:
-            self.neighbours.look(now, sighting.pose, sighting.scan)
+            self.neighbours.observe(now, sighting.pose, sighting.scan)
         self._global.update(now, sighting, pose, lambda: self.neighbours.costs(now, pose))
         self._local.update(now, sighting, pose)
 

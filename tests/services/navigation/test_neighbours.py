@@ -53,7 +53,7 @@ def tells(pose: Pose = THERE, cells: list[list[int]] | None = None, age: float =
 
 
 def hear(me: Neighbours, now: float, said: list[Said]) -> None:
-    me.hear(now, said)
+    me.receive(now, said)
     while me.read(now):
         pass
 
@@ -68,7 +68,7 @@ def has(layer: Costs | None, row: int, column: int) -> bool:
 
 def test_without_a_group_nothing_is_told_and_nothing_counts() -> None:
     alone = neighbours()
-    alone.look(0.0, ME, scan(ME, (3.0, 2.0)))
+    alone.observe(0.0, ME, scan(ME, (3.0, 2.0)))
     assert alone.word(0.1, ME, marks((20, 27))) is None
     assert alone.costs(0.1, ME) is None
     assert alone.names(0.1) == {}
@@ -77,7 +77,7 @@ def test_without_a_group_nothing_is_told_and_nothing_counts() -> None:
 def test_what_one_sees_the_other_plans_round() -> None:
     one, other = neighbours(), neighbours()
     hear(one, 0.0, [])
-    one.look(0.1, ME, scan(ME, (3.0, 2.0)))
+    one.observe(0.1, ME, scan(ME, (3.0, 2.0)))
     seen = [(row, column) for row in range(15, 26) for column in range(25, 36)]
     text = one.word(0.6, ME, marks(*seen))
     assert text is not None
@@ -99,7 +99,7 @@ def test_walls_of_the_map_are_no_obstacles_and_neither_is_what_was_not_just_seen
     one = neighbours(obstacles_last=60.0)
     hear(one, 0.0, [])
     near_wall = Pose(1.0, 5.0, math.pi)
-    one.look(0.1, near_wall, scan(near_wall, (0.0, 5.0), side=0.2))
+    one.observe(0.1, near_wall, scan(near_wall, (0.0, 5.0), side=0.2))
     text = one.word(0.2, near_wall, marks((50, 1), (50, 2), (30, 30)))
     assert text is not None
     read = read_word(text, map_id(STATIC), STATIC.costs.shape)
@@ -130,7 +130,7 @@ def test_a_newer_word_takes_the_place_of_the_last_one() -> None:
 def test_what_ones_own_laser_finds_free_is_free_until_another_sees_something_later() -> None:
     me = neighbours()
     hear(me, 0.0, [Said("other", 0.0, tells(cells=[[20, 40], [20, 70]]))])
-    me.look(0.5, ME, scan(ME))
+    me.observe(0.5, ME, scan(ME))
     layer = me.costs(0.5, ME)
     assert not has(layer, 20, 40), "2 m ahead, and nothing is there"
     assert has(layer, 20, 70), "beyond the range in which rays clear"
@@ -155,7 +155,7 @@ def test_a_robot_is_not_told_of_itself() -> None:
     me = neighbours()
     hear(me, 0.0, [])
     for n in range(50):
-        me.look(0.1 * n, Pose(2.0 + 0.05 * n, 2.0, 0.0), scan(ME))
+        me.observe(0.1 * n, Pose(2.0 + 0.05 * n, 2.0, 0.0), scan(ME))
     # At 2.0 s it was at x = 3 m, and another one saw it there; at 5 s it is elsewhere. What is at x = 4.5 m is real.
     hear(me, 5.0, [Said("other", 1.0, tells(cells=[[20, 30], [20, 45]], age=2.0))])
     layer = me.costs(5.0, Pose(7.0, 7.0, 0.0))
@@ -167,7 +167,7 @@ def test_a_robot_is_no_obstacle_to_be_told_of() -> None:
     me = neighbours()
     there = Pose(3.0, 2.0, 0.0)
     hear(me, 0.0, [Said("other", 0.0, tells(there))])
-    me.look(0.1, ME, scan(ME, (3.0, 2.0)))
+    me.observe(0.1, ME, scan(ME, (3.0, 2.0)))
     seen = marks(*[(row, column) for row in range(16, 25) for column in range(25, 35)])
     text = me.word(0.2, ME, seen)
     assert text is not None
@@ -176,7 +176,7 @@ def test_a_robot_is_no_obstacle_to_be_told_of() -> None:
     assert read.cells.tolist() == []
     # When it has said nothing for long, what is seen there is something.
     hear(me, 9.0, [])
-    me.look(9.1, ME, scan(ME, (3.0, 2.0)))
+    me.observe(9.1, ME, scan(ME, (3.0, 2.0)))
     text = me.word(9.2, ME, seen)
     assert text is not None
     read = read_word(text, map_id(STATIC), STATIC.costs.shape)
@@ -204,10 +204,10 @@ def test_news_that_come_too_often_are_not_read() -> None:
 def test_a_crowd_is_read_one_by_one_and_nobody_is_passed_over() -> None:
     me = neighbours()
     crowd = [Said(f"r{n}", 0.5, tells()) for n in range(10)]
-    me.hear(0.0, crowd)
+    me.receive(0.0, crowd)
     for n in range(4):
         assert me.read(0.1 * n)
-    me.hear(1.0, crowd)
+    me.receive(1.0, crowd)
     for _ in range(6):
         me.read(1.0)
     assert len(me.names(1.0)) == 10, "what came meanwhile did not begin anew"
