@@ -206,7 +206,7 @@ class Navigator:
         self._command = STANDSTILL
         if self.surroundings is not None:
             self.surroundings.neighbours.read(now)
-        sighting = self.whereabouts.look(now)
+        sighting = self.whereabouts.match_scan(now)
         state = self.whereabouts.state()
         trouble = self.no_map or self.whereabouts.trouble(now)
         if state is not None and self.surroundings is not None and trouble is None:

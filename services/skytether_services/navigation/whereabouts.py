@@ -92,7 +92,7 @@ class Whereabouts(Senses):
         self._map_from_odometry = compose(pose, inverse(newest.pose)) if newest is not None else None
         self._at_scan = newest.pose if newest is not None else None
 
-    def look(self, now: float) -> Sighting | None:
+    def match_scan(self, now: float) -> Sighting | None:
         """Compare the scan that waits with the map, once there is odometry of its moment; None: nothing new."""
         taken = self.take_scan(now) if self._localisation is not None else None
         if taken is None or self._localisation is None:
