@@ -137,7 +137,7 @@ class Navigation(Service[Params]):
             self._clients.refuse("A map is being built: the robot takes no goals.")
             self._sense(self._mapping.senses)
             self._mapping.step(now)
-            self._tell_mapping(self._mapping, now)
+            self._publish_mapping(self._mapping, now)
             return
         self._sense(self.navigator.whereabouts)
         self._listen()
@@ -148,7 +148,7 @@ class Navigation(Service[Params]):
         self._clients.listen(self.navigator, now)
         velocity = self.navigator.step(now, self._delay.seconds)
         self.cmd_vel.publish(Twist(Vector3(x=velocity.linear), Vector3(z=velocity.angular)))
-        self._tell(now)
+        self._publish(now)
         self._clients.update_client(self.navigator, now, self._stamp)
 
     @answers(Trigger)
@@ -274,7 +274,7 @@ class Navigation(Service[Params]):
         if self._lasting.due(new, now, 0.0 if is_end else _LASTS):
             self.report(report.code if report.trouble is not None else str(report.doing), report.message)
 
-    def _tell(self, now: float) -> None:
+    def _publish(self, now: float) -> None:
         """Publish what people and programs want to see."""
         navigator = self.navigator
         report = navigator.report()
@@ -305,7 +305,7 @@ class Navigation(Service[Params]):
             if surroundings.whole is not None and self._due["global"].due(now):
                 self.global_costmap.publish(convert.costmap_message(surroundings.whole, self._stamp))
 
-    def _tell_mapping(self, mapping: MappingMode, now: float) -> None:
+    def _publish_mapping(self, mapping: MappingMode, now: float) -> None:
         """Likewise, of the mode that maps."""
         trouble = mapping.trouble(now)
         message = trouble.message if trouble is not None else "A map is built of what the laser sees."
