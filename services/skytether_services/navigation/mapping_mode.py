@@ -79,7 +79,7 @@ class MappingMode:
     def step(self, now: float) -> None:
         """Take what the thread has done, and give it what is new."""
         self._collect(now)
-        taken = self.senses.take_scan(now)
+        taken = self.senses.pop_scan(now)
         if taken is not None:
             self._match(*taken)
         scans = self.progress.scans if self.progress is not None else 0

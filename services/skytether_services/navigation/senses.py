@@ -95,7 +95,7 @@ class Senses:
         return jumped
 
     def scan(self, scan: LaserScan) -> None:
-        """Take a scan; `take_scan` hands it on. One whose geometry is not finite is a blind one."""
+        """Take a scan; `pop_scan` hands it on. One whose geometry is not finite is a blind one."""
         geometry = (scan.stamp, scan.at, scan.angle_min, scan.angle_increment, scan.range_min, *scan.laser)
         good = all(map(math.isfinite, geometry)) and not math.isnan(scan.range_max) and scan.ranges.size > 0
         self._scanned_at = scan.at if math.isfinite(scan.at) else self._scanned_at
@@ -108,7 +108,7 @@ class Senses:
         newest = self._track.newest
         return newest.pose if newest is not None else None
 
-    def take_scan(self, now: float) -> tuple[LaserScan, Pose] | None:
+    def pop_scan(self, now: float) -> tuple[LaserScan, Pose] | None:
         """The scan that waits, with the track's pose of its moment, once there is one; None: nothing new."""
         scan, newest = self._waiting, self._track.newest
         if scan is None or newest is None:

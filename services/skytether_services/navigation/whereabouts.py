@@ -94,7 +94,7 @@ class Whereabouts(Senses):
 
     def match_scan(self, now: float) -> Sighting | None:
         """Compare the scan that waits with the map, once there is odometry of its moment; None: nothing new."""
-        taken = self.take_scan(now) if self._localisation is not None else None
+        taken = self.pop_scan(now) if self._localisation is not None else None
         if taken is None or self._localisation is None:
             return None
         scan, at_scan = taken
