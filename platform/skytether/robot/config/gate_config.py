@@ -40,7 +40,7 @@ class _GateFile(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _take_from_the_robot(cls, document: Any) -> Any:
+    def _inherit_from_robot(cls, document: Any) -> Any:
         if isinstance(document, dict) and "safety" not in document:  # a slip must not be a gate without sensors
             meant = [key for key in document if get_close_matches("safety", [str(key).lower()], cutoff=_ALIKE)]
             if meant:
