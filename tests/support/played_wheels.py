@@ -36,7 +36,7 @@ class Wheels:
     def __post_init__(self) -> None:
         self.random = Random(self.seed)
 
-    def tell(self, velocity: Velocity, now: float) -> None:
+    def write(self, velocity: Velocity, now: float) -> None:
         self.told.append((now, velocity))
 
     def roll(self, now: float, dt: float) -> None:

@@ -30,7 +30,7 @@ class Drives:
     edge_at: float = -1e9
     high: bool = False
 
-    def tell(self, velocity: Velocity, now: float) -> None:
+    def write(self, velocity: Velocity, now: float) -> None:
         self.told.append((now, velocity))
 
     def enable(self, high: bool, now: float) -> None:

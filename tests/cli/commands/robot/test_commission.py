@@ -87,7 +87,7 @@ class Machine:
                 now = time.monotonic()
                 for data in _waiting(self._wheels):
                     twist = decode(Twist, data)
-                    self.drives.tell(Velocity(twist.linear.x, twist.angular.z), now)
+                    self.drives.write(Velocity(twist.linear.x, twist.angular.z), now)
                 for data in _waiting(self._power):
                     self.drives.enable(bool(decode(Bool, data).data), now)
                 self.drives.roll(now, now - last)

@@ -27,7 +27,7 @@ class FakeRig:
             self.time += TURN
             self.turns += 1
             if velocity is not None:
-                self.drives.tell(velocity, self.time)
+                self.drives.write(velocity, self.time)
             self.drives.enable(self.on and not self.drives.high, self.time)
             self.drives.roll(self.time, TURN)
             if self.turns % 2:

@@ -31,7 +31,7 @@ class Bench:
             self.now += TURN
             self.turns += 1
             self.motion.told(velocity, self.now)
-            self.wheels.tell(velocity, self.now)
+            self.wheels.write(velocity, self.now)
             self.wheels.roll(self.now, TURN)
             if self.turns % round(READING / TURN) == 0:
                 self.motion.measure(odometry(*self.wheels.reading(self.now), self.now), self.now)

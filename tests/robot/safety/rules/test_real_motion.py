@@ -47,7 +47,7 @@ class Robot:
                 self.gate.sense("odom", odometry(*self.wheels.reading(self.now), self.now), self.now)
             self.gate.command(Command(Hand.AGENT, linear, angular, 1, self.turns, self.now, 0.0, self.now), self.now)
             self.last = self.gate.step(self.now)
-            self.wheels.tell(self.last.velocity, self.now)
+            self.wheels.write(self.last.velocity, self.now)
         return self.last
 
 
