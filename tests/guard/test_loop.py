@@ -37,7 +37,7 @@ class Played:
         """What it does last, between two looks of the guard."""
         Played.made.append(self)
 
-    def say(self, **beat):
+    def send(self, **beat):
         self.theirs.send(pack_beat(Beat(NOW, STANDSTILL, **beat)))
 
     def heard(self):
@@ -77,9 +77,9 @@ def guard(tmp_path, monkeypatch):
     made = Guard(settings, Log("guard", os.open(os.devnull, os.O_WRONLY)), [], lambda: NOW)
     made.turn()  # starts the gate
     (gate,) = Played.made
-    gate.say()
+    gate.send()
     made.turn()
-    gate.say(seen=gate.heard().generation, reset=True)
+    gate.send(seen=gate.heard().generation, reset=True)
     made.turn()
     assert gate.heard().stopped == ""
     yield made
@@ -111,17 +111,17 @@ def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, tmp_path, unrea
     if unread:
         gate.socket.send(pack_answer(Answer(0.0)))
 
-    def say_last():
+    def send_last():
         for _ in range(before):
-            gate.say(seen=generation)
-        gate.say(seen=generation, stopped="somebody fell")
+            gate.send(seen=generation)
+        gate.send(seen=generation, stopped="somebody fell")
         gate.theirs.close()
         gate.dies = None
 
     if reaped:
-        gate.dies = say_last
+        gate.dies = send_last
     else:
-        say_last()
+        send_last()
         guard.turn()
     guard.turn()
     assert ask(guard, tmp_path, do="status")["stopped"] == "somebody fell"
@@ -130,9 +130,9 @@ def test_a_stop_that_was_the_last_word_of_a_gate_is_heard(guard, tmp_path, unrea
 def test_each_stop_reset_and_death_is_in_the_event_record(guard, tmp_path):
     (gate,) = Played.made
     generation = gate.heard().generation
-    gate.say(seen=generation, stopped="somebody fell")
+    gate.send(seen=generation, stopped="somebody fell")
     guard.turn()
-    gate.say(seen=gate.heard().generation, reset=True)
+    gate.send(seen=gate.heard().generation, reset=True)
     guard.turn()
     ask(guard, tmp_path, do="stop", reason="a fire")
     gate.dies = gate.theirs.close

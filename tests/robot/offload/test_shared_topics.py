@@ -50,7 +50,7 @@ class Scene:
         session.notify(Connected(()))
         return Serving(session, "i1", topics)
 
-    def say(self, text, *, payload=None):
+    def deliver(self, text, *, payload=None):
         payload = encode(String(text), "cdr") if payload is None else payload
         self.serving.session.deliver(MessageReceived("seen", payload, 0, self.now, 0.0, self.now))
 
@@ -69,8 +69,8 @@ def scene(bridge):
 
 
 def test_what_the_service_says_goes_out_once_and_what_the_others_say_comes_in(scene):
-    scene.say("old")
-    scene.say("a wall")
+    scene.deliver("old")
+    scene.deliver("a wall")
     scene.after(0.25)
     assert scene.exchange.asked == [("i1", Share(text="a wall", age_s=0.25))]
     assert scene.heard == [("heard", [{"robot": "other", "age_s": 0.5, "text": "a crate"}])]
@@ -107,7 +107,7 @@ def test_nothing_is_asked_for_a_service_that_shares_nothing_or_that_is_not_there
 
 def test_a_service_that_only_tells_hears_nothing(bridge):
     scene = Scene(bridge, SharedTopics("seen", None))
-    scene.say("a wall")
+    scene.deliver("a wall")
     scene.after(1.0)
     assert scene.exchange.asked == [("i1", Share(text="a wall", age_s=1.0))]
     assert scene.heard == []
@@ -124,13 +124,13 @@ def test_an_orchestrator_that_is_away_is_asked_again_later(scene):
 
 
 def test_what_is_no_text_or_too_long_is_left_out_and_named(scene, caplog):
-    scene.say("", payload=b"\x00\x01\x00\x00\xff\xff\xff\xff")
+    scene.deliver("", payload=b"\x00\x01\x00\x00\xff\xff\xff\xff")
     scene.after(1.0)
-    scene.say("x" * (MOST_SHARED + 1))
+    scene.deliver("x" * (MOST_SHARED + 1))
     scene.after(1.0)
-    scene.say("a bell \a")
+    scene.deliver("a bell \a")
     scene.after(1.0)
-    scene.say("two\tlines\n")
+    scene.deliver("two\tlines\n")
     scene.after(1.0)
     assert [share.text for _, share in scene.exchange.asked] == [None, None, None, "two\tlines\n"]
     assert f"{MOST_SHARED} at most are carried" in caplog.text

@@ -51,7 +51,7 @@ class Rig:
         task = TaskConfig(**{"battery": lambda: (0.5, False), **config})
         self.tasks = SiteProber(task, sites, "guide", drives=True, clock=lambda: self.now, load=lambda: 0.3)
 
-    def look(self, times=1):
+    def step(self, times=1):
         for _ in range(times):
             self.tasks.step()
             self.now += 1.0
@@ -65,7 +65,7 @@ def rig():
 
 def test_it_probes_and_decides_and_says_each_decision_once(rig, caplog):
     caplog.set_level(logging.WARNING)
-    decision = rig.look(20)
+    decision = rig.step(20)
     assert decision.site == "edge"
     assert [m[:32] for m in caplog.messages] == ["task: offload: nothing is measur", "task: offload: edge 0.17 (delay "]
     assert rig.sites.listed == 1
@@ -77,43 +77,43 @@ def test_it_probes_and_decides_and_says_each_decision_once(rig, caplog):
 
 def test_an_orchestrator_that_is_away_changes_nothing_and_is_asked_again(rig):
     rig.sites.fail = Unreachable("away")
-    assert rig.look(50).offload
+    assert rig.step(50).offload
     rig.sites.fail = None
-    assert rig.look(5).site == "edge"
+    assert rig.step(5).site == "edge"
     rig.sites.fail = ApiError(Problem(title="no", status=500))
-    assert rig.look(100).site == "edge", "who is away is no slow site"
+    assert rig.step(100).site == "edge", "who is away is no slow site"
 
 
 def test_it_moves_when_the_link_to_where_it_is_has_been_bad(rig, orchestrator):
-    rig.look(5)
+    rig.step(5)
     orchestrator.placement = Placement(site="edge")
     here = orchestrator.get_instance("i1")
     rig.tasks.placed(here)
     rig.tasks.live(PathQuality(0.5, 0.0, 0.0))
-    assert rig.look(3).site == "edge"
-    assert rig.look(3).site == "cloud"
+    assert rig.step(3).site == "edge"
+    assert rig.step(3).site == "cloud"
     rig.tasks.placed(here)
     assert rig.tasks.decision.site == "cloud", "what is held still is no news"
     rig.tasks.stayed(here, "no room")
     assert rig.tasks.decision.site == "edge"
-    option = {o.name: o for o in rig.look().options}["cloud"]
+    option = {o.name: o for o in rig.step().options}["cloud"]
     assert option.refused == "no room"
 
 
 def test_what_placement_refused_is_not_asked_for_again_at_once(rig, orchestrator):
-    rig.look(5)
+    rig.step(5)
     refused = (Refusal(site="edge", reason="cpu", detail="needs 1 core"),)
     orchestrator.placement = Placement(site="cloud", refused=refused)
     rig.tasks.placed(orchestrator.get_instance("i1"))
-    assert rig.look(30).site == "cloud"
-    assert rig.look(60).site == "edge"
+    assert rig.step(30).site == "cloud"
+    assert rig.step(60).site == "edge"
 
 
 def test_a_site_with_an_echo_is_probed_by_udp():
     with EchoServer("127.0.0.1", 0) as server:
         rig = Rig(Sites(), echoes={"cloud": server.address})
         rig.sites.rtt["cloud"] = 9.0  # what the orchestrator would say
-        decision = rig.look(4)
+        decision = rig.step(4)
     assert {o.name: o.refused for o in decision.options}["cloud"] == ""
     rig.tasks.run(Ended())
 
@@ -129,7 +129,7 @@ def test_the_systems_battery_is_known_or_not():
 
 
 def test_a_move_by_the_orchestrator_is_not_contradicted(rig, orchestrator):
-    rig.look(5)
+    rig.step(5)
     for site in ("edge", "cloud"):
         orchestrator.placement = Placement(site=site)
         rig.tasks.placed(orchestrator.get_instance("i1"))
