@@ -5,6 +5,7 @@ import subprocess
 import pytest
 from docker_site import Images
 
+from skytether.lab.bench import containers
 from skytether.lab.bench.pair import BenchError
 from skytether.lab.bench.pods import kubectl
 from skytether.lab.bench.start import bench_start
@@ -25,9 +26,11 @@ def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_l
     owners: set[str] = set()
 
     def on_start(row: str, seconds: float) -> None:
-        owners.update(docker_images.containers("virtual-trail", "skytether.io/owner"))
+        owners.update(own.containers("virtual-trail", "skytether.io/owner"))
 
-    rows = bench_start(1, ["docker"], docker_images.prefix, on_start)
+    with docker_images.apart("virtual-trail") as own:
+        rows = bench_start(1, ["docker"], own.prefix, on_start)
+        left = own.containers("virtual-trail")
     # How fast it is, the benchmark says where it is run for that; here a busy machine may take its time.
     assert [(row.runtime, row.standby, row.n) for row in rows] == [
         ("docker", 0, 1),
@@ -35,7 +38,7 @@ def test_containers_are_started_cold_and_warm_beside_docker_run_and_nothing_is_l
         ("docker", 1, 1),
     ]
     assert all(0 < row.p50_s == row.p99_s for row in rows)
-    assert docker_images.containers("virtual-trail") == []
+    assert left == []
     (owner,) = owners
     assert owner.startswith("bench-")
     assert docker("network", "ls", "-q", "--filter", f"name={owner}") == []
@@ -54,3 +57,19 @@ def test_pods_are_started_cold_and_warm_and_their_namespace_goes(
     assert all(0 < row.p50_s == row.p99_s for row in rows)
     said = kubectl(kubeconfig, "get", "namespaces", "--no-headers").splitlines()
     assert all("Terminating" in line for line in said if line.startswith("skytether-bench-"))
+
+
+def test_a_container_that_the_site_removes_itself_just_then_is_waited_for(monkeypatch):
+    """The engine refuses to remove what is being removed."""
+    there, asked = ["c1"], []
+
+    def engine(*words):
+        asked.append(words[0])
+        if words[0] == "rm":
+            there.clear()
+            raise BenchError("removal of container c1 is already in progress")
+        return " ".join(there) if words[0] == "ps" else ""
+
+    monkeypatch.setattr(containers, "docker", engine)
+    containers.clean("bench-1", "net")
+    assert asked == ["ps", "rm", "ps", "volume", "network"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import subprocess
 import sys
@@ -60,6 +61,20 @@ class Images:
         build(self.prefix, image)
         yield self.name(image)
         self.remove(image)
+
+    @contextmanager
+    def apart(self, image: str) -> Iterator[Images]:
+        """Guard and one image under names of their own: a container of it is of who has these, whoever else is here."""
+        own = Images(f"{self.prefix}{secrets.token_hex(4)}/", [])
+        recipe = f"FROM {self.name(image)}\nLABEL apart={own.prefix}\n"
+        command = ["docker", "build", "-q", "-t", own.name(image), "-"]
+        environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
+        try:
+            subprocess.run(command, input=recipe, text=True, check=True, capture_output=True, env=environment)
+            subprocess.run(["docker", "tag", self.name("guard"), own.name("guard")], check=True)
+            yield own
+        finally:
+            own.remove(image, "guard")
 
     def remove(self, *images: str) -> None:
         """Remove them from the engine, with the layers that are nobody else's."""
