@@ -12,27 +12,27 @@ UNIT := $(BIN)/pytest -m "not slow"
 BY := -n $$(($$(nproc) + 1)) --dist loadfile
 SLOW := $(BIN)/pytest --durations 30 -m "slow
 
-.PHONY: demo test slow-engine slow-others slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit ros2 lock clean
+.PHONY: demo test slow-together slow-timed slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit ros2 lock clean
 
 demo: $(READY) ## run the main job: a walker asks for virtual-trail and is driven across an emulated network
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
 	$(UNIT) $(BY)
-	@echo "Slow tests that bear company, in two rows side by side; each row is shown when it is done ..."
 	@export SKYTETHER_TEST_IMAGES=skytether-test-$$$$/; trap '.ci/remove-images "$$SKYTETHER_TEST_IMAGES"' EXIT; trap 'exit 130' INT TERM; \
-		failed=0; $(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync slow-engine slow-others || failed=1; \
-		echo "The other slow tests, one at a time ..."; $(SLOW) and not together and not kubernetes" || failed=1; \
+		failed=0; echo "Slow tests that bear company ..."; $(MAKE) --no-print-directory slow-together || failed=1; \
+		echo "Slow tests that look at the clock, two at a time ..."; $(MAKE) --no-print-directory slow-timed || failed=1; \
 		echo "A cluster, for the tests that need one ..."; $(MAKE) --no-print-directory slow-kubernetes || failed=1; exit $$failed
 
-slow-engine: $(READY)
-	$(SLOW) and together and first_row and not kubernetes"
+slow-together: $(READY)
+	$(SLOW) and together and not kubernetes" $(BY) --no-loadscope-reorder
+
+# Most of what looks at the clock is idle most of the time.
+slow-timed: $(READY)
+	$(SLOW) and not together and not kubernetes" -n 2 --dist worksteal
 
 slow-kubernetes: $(READY)
 	$(SLOW) and kubernetes"
-
-slow-others: $(READY)
-	$(SLOW) and together and not first_row and not kubernetes"
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) $(BY)

@@ -38,7 +38,9 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 TOGETHER = (
+    "api/test_bounded.py",
     "bridge/test_mtu.py",
+    "bridge/test_nat.py",
     "cli/commands/bridge/test_bridge.py",
     "cli/commands/robot/test_commission.py",
     "cli/test_names.py",
@@ -57,13 +59,18 @@ TOGETHER = (
     "e2e/test_replay.py",
     "e2e/test_rolling_nodes.py",
     "jepsen/",
+    "lab/test_bench_api.py",
     "lab/test_bench_bridge.py",
+    "lab/test_bench_bridge_ros2.py",
+    "lab/test_bench_failover.py",
     "lab/test_bench_face.py",
     "lab/test_bench_fleet.py",
     "lab/test_bench_legs.py",
     "lab/test_bench_mapping.py",
     "lab/test_bench_migrate.py",
+    "lab/test_bench_resize.py",
     "lab/test_bench_ros.py",
+    "lab/test_bench_safety.py",
     "lab/test_bench_scale.py",
     "lab/test_bench_join.py",
     "lab/test_bench_start.py",
@@ -78,10 +85,15 @@ TOGETHER = (
     "orchestrator/test_crowd.py",
     "orchestrator/test_disk_full.py",
     "orchestrator/runtimes/docker/test_runtime.py",
+    "orchestrator/domain/test_clock_jump.py",
+    "orchestrator/http/test_api.py",
+    "orchestrator/runtimes/docker/test_docker_resize.py",
     "orchestrator/runtimes/docker/test_fence.py",
     "orchestrator/runtimes/docker/test_namespaces.py",
     "orchestrator/runtimes/docker/test_docker_orchestrated.py",
+    "orchestrator/nodes/test_nodes_attacks.py",
     "orchestrator/nodes/test_nodes_docker.py",
+    "orchestrator/nodes/test_nodes_replicas.py",
     "orchestrator/test_faults.py",
     "orchestrator/test_faults_engine.py",
     "orchestrator/runtimes/test_file_log.py",
@@ -102,9 +114,11 @@ TOGETHER = (
     "orchestrator/runtimes/test_process.py",
     "orchestrator/runtimes/test_process_fence.py",
     "orchestrator/scheduling/test_reconcile.py",
+    "orchestrator/test_rolling.py",
     "orchestrator/test_replicas.py",
     "orchestrator/groups/test_scaler.py",
     "orchestrator/http/test_server.py",
+    "orchestrator/telemetry/test_heartbeat.py",
     "orchestrator/telemetry/test_service_events.py",
     "orchestrator/store/test_store.py",
     "orchestrator/telemetry/test_tls_and_logs.py",
@@ -117,6 +131,7 @@ TOGETHER = (
     "robot/control/test_failure_detector.py",
     "robot/control/test_arbiter.py",
     "robot/graphs/ros2/",
+    "robot/agent/test_agent_survives.py",
     "robot/agent/test_status.py",
     "robot/control/test_supervisor.py",
     "robot/offload/test_task_manager.py",
@@ -139,14 +154,32 @@ TOGETHER = (
 )
 """Where slow tests bear company: their time is made up, or they wait for what they expect, however long it takes."""
 
-FIRST_ROW = (
+LONGEST = (
     "e2e/test_navigation_guide.py",
-    "ros/ros1/test_gate.py",
-    "ros/ros1/test_own_gate.py",
-    "ros/ros2/native/",
-    "jepsen/",
+    "orchestrator/test_faults_engine.py",
+    "ros/ros2/native/test_walk.py",
+    "e2e/test_compose.py",
+    "jepsen/test_short.py",
+    "ros/ros2/native/test_robot_run.py",
+    "orchestrator/test_navigation_image.py",
+    "e2e/test_rolling_nodes.py",
+    "lab/test_nine_goals.py",
+    "orchestrator/runtimes/docker/test_fence.py",
+    "orchestrator/runtimes/docker/test_runtime.py",
+    "lab/test_bench_safety.py",
+    "contracts/test_runtime_contract.py",
+    "contracts/test_two_leaders.py",
+    "ros/ros1/test_service_container.py",
+    "lab/test_bench_bridge.py",
+    "orchestrator/runtimes/docker/test_docker_resize.py",
+    "ros/ros2/native/test_service_container.py",
+    "lab/test_bench_mapping.py",
+    "orchestrator/groups/test_scaler.py",
+    "orchestrator/test_follow_image.py",
+    "ros/ros2/native/test_node.py",
+    "cli/commands/robot/test_commission.py",
 )
-"""Of these, what runs beside the others with what needs the Docker engine: so both rows take as long."""
+"""Of these, the files of a minute and more: they begin first, so that at the end nobody waits for one of them."""
 
 ALONE = (
     "orchestrator/http/test_server.py::test_a_killed_orchestrator_comes_back",
@@ -186,7 +219,7 @@ _OPEN = pytest.StashKey[int]()
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `make test` runs two at a time, and what it may run again."""
+    """Mark what `make test` runs beside others, and what it may run again; the longest files come first."""
     here = Path(__file__).parent
     for path, ours in groupby(items, key=lambda item: item.path):
         if not path.is_relative_to(here):
@@ -196,12 +229,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             name = f"{file}::{item.name}"
             if name.startswith(TOGETHER) and not name.startswith(ALONE):
                 item.add_marker(pytest.mark.together)
-                if item.get_closest_marker("docker") or name.startswith(FIRST_ROW):
-                    item.add_marker(pytest.mark.first_row)
             if item.get_closest_marker("flaky"):
                 raise pytest.UsageError(f"{name}: what may be run again stands in RERUN in tests/conftest.py, with why")
             if item.get_closest_marker("slow") and name.startswith(tuple(RERUN)):
                 item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=3))
+    rank = {here / file: number for number, file in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 def pytest_configure() -> None:
