@@ -77,7 +77,7 @@ class FollowInFront(Service[Params]):
         """Hand what the robot measured on, but for pictures."""
         if tf := self.tf.take():
             self._delay.note(tf)
-            self._frames.hear(tf.message)
+            self._frames.set_transforms(tf.message)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
                 self._follower.odometry(found[1], found[0], tf.made_at, now)
         if odom := self.odom.take():

@@ -189,7 +189,7 @@ class Navigation(Service[Params]):
     def _sense(self, senses: Senses) -> None:
         """Hand what the robot measured on."""
         if tf := self.tf.take():
-            self._frames.hear(tf.message)
+            self._frames.set_transforms(tf.message)
             self._delay.note(tf)
             if (found := self._frames.lookup(self._odom_frame, self._base_frame)) and math.isfinite(found[1]):
                 senses.odometry(found[1], found[0], tf.sent_at)

@@ -31,8 +31,8 @@ class Frames:
     def __init__(self) -> None:
         self._links: dict[str, _Link] = {}
 
-    def hear(self, message: TFMessage) -> None:
-        """Take transforms; what is not finite is left out."""
+    def set_transforms(self, message: TFMessage) -> None:
+        """Keep transforms, as tf2's Buffer does; what is not finite is left out."""
         for transform in message.transforms:
             pose = pose_of(transform)
             child = bare(transform.child_frame_id)
