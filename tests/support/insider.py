@@ -6,7 +6,7 @@ from skytether.wire.state.epoch import Epoch
 
 def epoch_of(session: Session) -> Epoch:
     """The keys that an end uses, and where it is with them."""
-    epoch = session._epoch  # noqa: SLF001 keys are what a session must show nobody
+    epoch = session._epochs.current  # noqa: SLF001 keys are what a session must show nobody
     assert epoch is not None
     return epoch
 

@@ -24,6 +24,7 @@ from .receive.delivery import Delivery
 from .receive.receiver import AuthenticMessage, Receiver
 from .send.sender import Sender
 from .state.epoch import Epoch
+from .state.epochs import Epochs
 from .state.reliable_topics import ReliableTopics
 from .state.topic_counters import TopicCounters
 from .stats import SessionStats
@@ -95,10 +96,7 @@ class Session:
             welcome_tags if service else hello_tags, self._events, self._rejected,
         )  # fmt: skip
 
-        self._epoch: Epoch | None = None
-        self._previous: Epoch | None = None
-        """Keys before the latest handshake; they open packets that were on their way until ``_previous_until``."""
-        self._previous_until = math.inf
+        self._epochs = Epochs(self._config.old_keys)
         self._connected = False
         self._closed = False
         self._handshakes = 0
@@ -123,7 +121,7 @@ class Session:
             KeyError: The topic is not in this end's table, or this end does not send it.
             ValueError: The payload is larger than ``Config.max_message``.
         """
-        epoch = self._epoch
+        epoch = self._epochs.current
         sender = epoch.send.get(topic) if epoch is not None else None
         reliable = (
             self._reliable.sender(topic) if epoch is None else sender.reliable_sender if sender is not None else None
@@ -166,7 +164,7 @@ class Session:
                 each.peer = each.address = address
                 each.validation.clear()
         if self._responder is None and not self._closed:
-            self._reconnector.set_peers({p.peer for p in self._paths}, connected=self._epoch is not None)
+            self._reconnector.set_peers({p.peer for p in self._paths}, connected=self._epochs.current is not None)
 
     def open_path(self, path: int, now: float, *, cost: int = 0, peer: Hashable | None = None) -> None:
         """Add a path from the robot's end, or change its cost; path 0 is there from the beginning.
@@ -222,7 +220,7 @@ class Session:
         """Say goodbye. Call `transmit` once more to send it; then the session is over."""
         if self._closed:
             return
-        if self._epoch is not None:
+        if self._epochs.current is not None:
             self._report(now)
             for _ in range(GOODBYES):
                 self._sender.queue_frame(frames.push_goodbye(), now)
@@ -234,10 +232,10 @@ class Session:
         """A snapshot of all counters, both directions."""
         clock = self._delivery.clock
         table = dict(self._table)
-        if self._epoch is not None:
-            for receiver in self._epoch.receive.values():
+        if self._epochs.current is not None:
+            for receiver in self._epochs.current.receive.values():
                 receiver.settle(now)
-            table.update((t.name, t) for t in self._epoch.topics)
+            table.update((t.name, t) for t in self._epochs.current.topics)
         table.pop(ANY, None)
         rejected = Counter(self._rejected)
         if self._receiver.messages.evicted:
@@ -321,7 +319,7 @@ class Session:
             self._rekey_at = math.inf
             self._reconnector.rekey(now)
         if now >= self._reconnector.due:
-            self._driver.send_hello(self._epoch, self._last_heard, now)
+            self._driver.send_hello(self._epochs.current, self._last_heard, now)
         self._paths.handle_timer(now, now - self._last_heard, self._connected)
         if now >= self._sweep_at:
             self._receiver.sweep(now)
@@ -333,13 +331,17 @@ class Session:
         if now >= self._report_at:
             self._report(now)
             self._report_at = now + self._config.report_interval
-            if self._responder is None and self._epoch is not None and self._epoch.volume >= self._config.rekey_bytes:
+            if (
+                self._responder is None
+                and self._epochs.current is not None
+                and self._epochs.current.volume >= self._config.rekey_bytes
+            ):
                 self._reconnector.rekey(now)
 
     # --- keys
 
     def _on_handshake(self, received: HandshakeMessage) -> None:
-        welcomed = self._driver.handle_handshake(received, self._epoch, self._previous)
+        welcomed = self._driver.handle_handshake(received, self._epochs.current, self._epochs.previous)
         if welcomed is not None:
             self._start_epoch(welcomed.epoch, received.now)
             times = welcomed.times
@@ -348,21 +350,12 @@ class Session:
             self._paths.welcomed(received.path, times[2] if times is not None else None, received.now)
 
     def _find_epoch(self, packet_id: int) -> Epoch | None:
-        epoch = self._epoch
-        if epoch is not None and epoch.ciphers.packet_id == packet_id:
-            return epoch
-        if self._previous is not None and self._previous.ciphers.packet_id == packet_id:
-            return self._previous
-        return self._responder.pending(packet_id) if self._responder is not None else None
+        epoch = self._epochs.find(packet_id)
+        return self._responder.pending(packet_id) if epoch is None and self._responder is not None else epoch
 
     def _start_epoch(self, epoch: Epoch, now: float) -> None:
         """Use the keys of a new handshake; those before stay for what is on its way."""
-        before = self._epoch
-        goes_on = before is not None and epoch.take_over(before)
-        self._drop_previous()
-        if before is not None:
-            self._previous, self._previous_until = before, now + self._config.old_keys
-        self._epoch = epoch
+        goes_on = self._epochs.start(epoch, now)
         self._handshakes += 1
         self._driver.done()
         self._last_heard = now
@@ -371,7 +364,7 @@ class Session:
         if goes_on:
             self._sender.change_keys(epoch)
             self._delivery.change_keys(epoch)
-            self._check_at = min(self._check_at, self._previous_until)
+            self._check_at = min(self._check_at, self._epochs.previous_until)
             if not self._connected:
                 self._connect(epoch.topics, now)
             return
@@ -387,8 +380,7 @@ class Session:
 
     def _end_epoch(self, now: float) -> None:
         """The peer said goodbye."""
-        self._drop_previous()
-        self._epoch = None
+        self._epochs.end()
         self._sender.start_epoch(None)
         self._delivery.end_epoch()
         self._reliable.start_epoch(None, now)
@@ -398,13 +390,6 @@ class Session:
             self._reconnector.pause(now + self._config.hello_retry)
         if self._connected:
             self._disconnect("goodbye")
-
-    def _drop_previous(self) -> None:
-        if self._previous is not None:
-            if not self._previous.belongs_with(self._epoch):
-                for receiver in self._previous.receive.values():
-                    receiver.settle(math.inf)
-            self._previous = None
 
     # --- connection
 
@@ -428,19 +413,15 @@ class Session:
                 self._disconnect("silent")
             else:
                 self._check_at = silent_at
-        if self._previous is not None:
-            until = max(self._previous_until, self._previous.heard_at + self._config.old_keys)
-            if now >= until:  # a large message that was on its way is there, or will never be
-                self._drop_previous()
-            else:
-                self._check_at = min(self._check_at, until)
+        self._check_at = min(self._check_at, self._epochs.check(now))
 
     # --- messages
 
     def _on_message(self, received: AuthenticMessage) -> None:
         epoch, index, plaintext, number, path, address, now = received
         asked_from: Hashable | None = None
-        if epoch is not self._epoch and epoch is not self._previous:  # the robot confirms a handshake
+        epochs = self._epochs
+        if epoch is not epochs.current and epoch is not epochs.previous:  # the robot confirms a handshake
             if self._responder is not None:
                 asked_from = self._responder.confirm(epoch)
             self._start_epoch(epoch, now)
@@ -448,7 +429,7 @@ class Session:
         if came_by is None and self._responder is not None:
             said = frames.pull_frame(plaintext[INNER.size :]) if index == 0 else None
             came_by = self._paths.admit(path, said, now)
-        if epoch is self._epoch and self._reconnector.counts(address):
+        if epoch is epochs.current and self._reconnector.counts(address):
             self._last_heard = now
             if came_by is not None:
                 size = len(plaintext) + TAG_SIZE
@@ -469,7 +450,7 @@ class Session:
         message = frames.pull_frame(data)
         if message is None:
             self._rejected["control"] += 1
-        elif not epoch.belongs_with(self._epoch):
+        elif not epoch.belongs_with(self._epochs.current):
             return
         elif isinstance(message, Ping):
             if path is not None and path.id == message.path:
@@ -493,9 +474,9 @@ class Session:
     # --- sending of our own accord
 
     def _report(self, now: float) -> None:
-        if self._epoch is None:
+        if self._epochs.current is None:
             return
-        for message in frames.push_reports(*self._counters.rows(self._epoch, now)):
+        for message in frames.push_reports(*self._counters.rows(self._epochs.current, now)):
             self._sender.queue_frame(message, now)
 
     def _queue_woken(self) -> None:

@@ -22,6 +22,7 @@ import struct
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from ..codec import crypto
 from ..codec.ciphers import Ciphers, HandshakeTags
@@ -188,6 +189,17 @@ class Resume:
     """HELLO of a robot that still holds the service's keys."""
 
 
+class _Hello(NamedTuple):
+    public: bytes
+    held: bytes
+    """Name of the keys that the robot holds."""
+    life: bytes
+    epoch: int
+    """Proposed."""
+    t1: int
+    offer: bytes
+
+
 class HandshakeResponder:
     """The service's end of all handshakes of a session."""
 
@@ -229,39 +241,59 @@ class HandshakeResponder:
             return known
         if name in self._used:
             return "hello_replayed"
+        hello = self._open_hello(common, message)
+        if isinstance(hello, str):
+            return hello
+        newest = self._newest.get(hello.life, -1)
+        if hello.held == held != NO_KEYS:
+            self._note(hello.life, max(hello.t1, newest))
+            return Resume()
+        if hello.t1 <= newest:
+            return "hello_replayed"
+        try:
+            offered = pull_offer(hello.offer)
+        except ValueError:
+            return "hello_malformed"
+        private = self._entropy(crypto.KEY_SIZE)
+        shared = crypto.exchange(private, hello.public)
+        if shared is None:
+            return "hello_malformed"
+        self._note(hello.life, hello.t1)
+        self._make_room()
+        busy = taken | {p.outcome.epoch for p in self._pending.values() if p.outcome}
+        epoch = next(e % 256 for e in range(hello.epoch, hello.epoch + 256) if e % 256 not in busy)
+        try:
+            agreed, reason = negotiate(offered, self._topics), ""
+        except TablesDifferError as error:
+            agreed, reason = [], str(error)[:MAX_REASON]
+        pending = self._pending[name] = self._welcome(hello, message, private, shared, epoch, agreed, reason, now)
+        return pending
+
+    def _open_hello(self, common: bytes, message: bytes) -> _Hello | str:
         salt = message[: crypto.SALT_SIZE]
         plaintext = crypto.open_once(_key(self._key, salt, b"hello"), message[crypto.SALT_SIZE :], common)
         if plaintext is None:
             return "hello_forged"
         if len(plaintext) < MIN_HELLO:
             return "hello_malformed"
-        public, robot_holds, life, proposed, t1, length = _HELLO.unpack_from(plaintext)
-        newest = self._newest.get(life, -1)
-        if robot_holds == held != NO_KEYS:
-            self._note(life, max(t1, newest))
-            return Resume()
-        if t1 <= newest:
-            return "hello_replayed"
-        try:
-            offered = pull_offer(plaintext[_HELLO.size : _HELLO.size + length])
-        except ValueError:
-            return "hello_malformed"
-        private = self._entropy(crypto.KEY_SIZE)
-        shared = crypto.exchange(private, public)
-        if shared is None:
-            return "hello_malformed"
-        self._note(life, t1)
-        self._make_room()
-        busy = taken | {p.outcome.epoch for p in self._pending.values() if p.outcome}
-        epoch = next(e % 256 for e in range(proposed, proposed + 256) if e % 256 not in busy)
-        reason, agreed = "", []
-        try:
-            agreed = negotiate(offered, self._topics)
-        except TablesDifferError as error:
-            reason = str(error)[:MAX_REASON]
+        public, held, life, epoch, t1, length = _HELLO.unpack_from(plaintext)
+        return _Hello(public, held, life, epoch, t1, plaintext[_HELLO.size : _HELLO.size + length])
+
+    def _welcome(
+        self,
+        hello: _Hello,
+        message: bytes,
+        private: bytes,
+        shared: bytes,
+        epoch: int,
+        agreed: list[tuple[int, Topic]],
+        reason: str,
+        now: float,
+    ) -> Pending:
+        """Seal the answer to a HELLO; with a reason it is a refusal."""
         text = reason.encode()[:MAX_REASON] if reason else push_answer(agreed)
         head = _WELCOME.pack(
-            crypto.public_of(private), self._life, epoch, bool(reason), t1, _micros(now), _micros(now), len(text)
+            crypto.public_of(private), self._life, epoch, bool(reason), hello.t1, _micros(now), _micros(now), len(text)
         )
         salt = self._entropy(crypto.SALT_SIZE)
         key = _key(self._key, salt, b"welcome", message)
@@ -270,10 +302,8 @@ class HandshakeResponder:
         outcome = None
         if not reason:
             to_service, to_robot, resume = crypto.data_keys(self._key, shared, message, welcome)
-            outcome = Outcome(epoch, Ciphers(to_robot, to_service, resume, packet_id), agreed, life)
-        pending = Pending(welcome_common, welcome, outcome, reason, life, now)
-        self._pending[name] = pending
-        return pending
+            outcome = Outcome(epoch, Ciphers(to_robot, to_service, resume, packet_id), agreed, hello.life)
+        return Pending(welcome_common, welcome, outcome, reason, hello.life, now)
 
     def pending(self, packet_id: int) -> Epoch | None:
         """The epoch whose packets have that id, of a handshake not confirmed yet."""
