@@ -27,15 +27,15 @@ def beating(
     path: str | None,
     in_step_for: Callable[[], float],
     period: float = BEAT_S,
-    tell: Callable[[], None] = lambda: None,
+    on_beat: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """Touch the ready file every ``period`` seconds, and ``tell`` as often; None: there is none."""
+    """Touch the ready file every ``period`` seconds, and call ``on_beat`` as often; None: there is none."""
     ended = threading.Event()
 
     def beat() -> None:
         while path is not None and not ended.wait(period):
             touch(path, in_step_for())
-            tell()
+            on_beat()
 
     thread = threading.Thread(target=beat, name="beat", daemon=True)
     if path is not None:

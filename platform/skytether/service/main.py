@@ -154,7 +154,7 @@ def _teller(service: Service[Any], clock: SystemClock, times: StepTimes | None) 
     return report
 
 
-def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant, tell: Callable[[], None]) -> int:
+def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant, on_beat: Callable[[], None]) -> int:
     """From start to stop, the bridge being up."""
     started = False
     gc.freeze()
@@ -165,7 +165,7 @@ def _work(service: Service[Any], loop: Loop, bridge: Bridge, grant: Grant, tell:
         warm_up(service, grant)
         gc.freeze()  # what is there now stays: looking through it would cost a step or two (20 ms) now and then
         write_ready_file(grant, bridge.address[1])
-        with beating(grant.ready_file, loop.in_step_for, tell=tell):
+        with beating(grant.ready_file, loop.in_step_for, on_beat=on_beat):
             loop.run()
     except ServiceError:
         raise
