@@ -138,32 +138,37 @@ class Admission:
                 await self._refusal_delay.wait()
             return await (await answer_to(Request(scope), error))(scope, receive, send)
         with contextlib.ExitStack() as until_answered:
-            if not until_answered.enter_context(self._one_of(caller)):
-                most = self._limits.robot_requests_at_once
-                text = f"{most} requests of this robot are under way: wait for their answers"
-                await self._refusal_delay.wait()
-                return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
-            with _Body(
-                self, self._limits.body_bytes if caller.robot is None else self._limits.robot_body_bytes
-            ) as body:
-                try:
-                    await body.read(scope, receive)
-                except _RefusedError as why:
-                    if renewal and why.busy:
-                        self._overload.note()
-                    return await why.answer(Request(scope))(scope, receive, send)
-                except _LeftError:
-                    return None
-                whole = bytes(body.data)
-            self._authenticator.charge(caller, len(whole))
-            return await self._place(
-                scope,
-                whole,
-                self._timed(began, send) if renewal else send,
-                renewal=renewal,
-                receive=receive,
-                until_answered=until_answered,
-            )
+            if until_answered.enter_context(self._one_of(caller)):
+                told = self._timed(began, send) if renewal else send
+                return await self._serve(scope, receive, told, caller, until_answered, renewal=renewal)
+            text = f"{self._limits.robot_requests_at_once} requests of this robot are under way: wait for their answers"
+            await self._refusal_delay.wait()
+            return await (await answer_to(Request(scope), TooManyError(1.0, text)))(scope, receive, send)
+
+    async def _serve(
+        self,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+        caller: Principal,
+        until_answered: contextlib.ExitStack,
+        *,
+        renewal: bool,
+    ) -> None:
+        """Read the body of somebody we know, and pass the request on."""
+        limits = self._limits
+        with _Body(self, limits.body_bytes if caller.robot is None else limits.robot_body_bytes) as body:
+            try:
+                await body.read(scope, receive)
+            except _RefusedError as why:
+                if renewal and why.busy:
+                    self._overload.note()
+                return await why.answer(Request(scope))(scope, receive, send)
+            except _LeftError:
+                return None
+            whole = bytes(body.data)
+        self._authenticator.charge(caller, len(whole))
+        return await self._place(scope, whole, send, renewal=renewal, receive=receive, until_answered=until_answered)
 
     async def _who(self, scope: Scope, renewal: bool) -> Principal:
         kind, _, token = Headers(scope=scope).get("authorization", "").partition(" ")
