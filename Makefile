@@ -29,7 +29,7 @@ slow-together: $(READY)
 
 # Most of what looks at the clock is idle most of the time.
 slow-timed: $(READY)
-	$(SLOW) and not together and not kubernetes" -n 2 --dist worksteal
+	$(SLOW) and not together and not kubernetes" -n 2 --dist loadfile --no-loadscope-reorder
 
 slow-kubernetes: $(READY)
 	$(SLOW) and kubernetes"

@@ -178,8 +178,10 @@ LONGEST = (
     "orchestrator/test_follow_image.py",
     "ros/ros2/native/test_node.py",
     "cli/commands/robot/test_commission.py",
+    "robot/safety/gate/test_guard_processes.py",
+    "robot/safety/gate/test_processes.py",
 )
-"""Of these, the files of a minute and more: they begin first, so that at the end nobody waits for one of them."""
+"""The files of a minute and more: they begin first, so that at the end nobody waits for one of them."""
 
 ALONE = (
     "orchestrator/http/test_server.py::test_a_killed_orchestrator_comes_back",
