@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import secrets
+import shutil
 import subprocess
 import sys
 import time
@@ -100,7 +102,19 @@ class Stack:
 
 
 @pytest.fixture(scope="module")
-def stack(compose_programs: None, docker_images: Images) -> Iterator[Stack]:
+def often(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The configuration of Prometheus, which asks each second."""
+    folder = Path(shutil.copytree(ROOT / "images/prometheus", tmp_path_factory.mktemp("prometheus") / "often"))
+    folder.chmod(0o755)
+    file = folder / "prometheus.yml"
+    text, changed = re.subn(r"(\w+_interval): \d+s", r"\1: 1s", file.read_text())
+    assert changed == 3
+    file.write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stack(compose_programs: None, docker_images: Images, often: Path) -> Iterator[Stack]:
     """Started as an operator starts it."""
     project = f"skytether-test-{secrets.token_hex(4)}"
     build = [sys.executable, str(ROOT / "images" / "build.py"), "--prefix", docker_images.prefix, "orchestrator"]
@@ -117,6 +131,7 @@ def stack(compose_programs: None, docker_images: Images) -> Iterator[Stack]:
             "SKYTETHER_NODES_ADDRESS": "127.0.0.1",
             "SKYTETHER_NODES_PORT": "0",
             "STAND_IN": stand_in,
+            "OFTEN": str(often),
             "DOCKER_GID": str(Path("/var/run/docker.sock").stat().st_gid),
         },
     )
