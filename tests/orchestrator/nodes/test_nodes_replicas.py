@@ -101,4 +101,5 @@ def test_of_many_joins_with_one_token_at_several_orchestrators_one_is_done(two: 
                 thread.join()
             assert said.count(name) == 1
             assert [text for text in said if "was used at" not in text] == [name]
-            assert [site.name for site in second.sites()].count(name) == 1
+            # The other orchestrator may have done it: this one looks from time to time.
+            until(lambda name=name: [site.name for site in second.sites()].count(name) == 1)  # type: ignore[misc]
