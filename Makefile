@@ -31,8 +31,10 @@ slow-together: $(READY)
 slow-timed: $(READY)
 	$(SLOW) and not together and not kubernetes" -n 2 --dist loadfile --no-loadscope-reorder
 
+# Most of their time is a wait for the node, that starts pods. Files are named, for each process reads all that is given.
 slow-kubernetes: $(READY)
-	$(SLOW) and kubernetes"
+	$(SLOW) and kubernetes" -n $$(($$(nproc) + 1)) --dist load --maxschedchunk 1 \
+		$$(grep -rl --include='*.py' 'mark\.kubernetes' tests | sed 's,/conftest.py$$,,' | sort)
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) $(BY)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes.util
 import gc
+import json
 import os
 import secrets
 import shutil
@@ -14,10 +15,11 @@ import time
 from collections.abc import Generator, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 from hypothesis import settings
+from one_run import begun_once, folder_of, turn
 from postgres_server import PostgresServer, own_server
 
 if TYPE_CHECKING:
@@ -192,6 +194,16 @@ ALONE = (
 )
 """Among those the ones that look at the clock."""
 
+CLUSTER_LONGEST = (
+    "test_a_release_drives_robots",
+    "test_eviction_a_kill_in_mid_start",
+    "test_two_orchestrators_over_postgresql",
+    "test_an_api_server_that_stands_still",
+    "test_a_standby_is_given_out",
+)
+"""Of those with a cluster the ones that take half a minute and more: several processes share them, and begin with them,
+or the end of the row would be a wait for one."""
+
 RERUN = {
     "bridge/test_clock.py": "measures one-way delays to a millisecond, on cores that others use too",
     "lab/test_bench_failover.py": "judges a cut to within three periods of the commands",
@@ -237,6 +249,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=3))
     rank = {here / file: number for number, file in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path, len(rank)))
+    _order(items)
+
+
+def _order(items: list[pytest.Item]) -> None:
+    """Of what needs a cluster first what takes longest, each with another, for a process is given two at a time; what
+    wants to be alone last."""
+    ours = [item for item in items if item.get_closest_marker("kubernetes")]
+    ours.sort(key=lambda item: item.get_closest_marker("whole_cluster") is not None)
+    longest = [item for name in CLUSTER_LONGEST for item in ours if item.name.startswith(name)]
+    others = [item for item in ours if item not in longest]
+    pairs = [item for pair in zip(longest, others, strict=False) for item in pair]
+    rest = [item for item in (*longest, *others) if item not in pairs]
+    items[:] = [item for item in items if not item.get_closest_marker("kubernetes")] + pairs + rest
 
 
 def pytest_configure() -> None:
@@ -473,24 +498,29 @@ def docker_images(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) 
 
     ``SKYTETHER_TEST_IMAGES`` names what they begin with, if several runs are to share them: nobody removes them then.
     """
-    from docker_site import TOY, Images, build
+    from docker_site import Images
 
     shared = os.environ.get("SKYTETHER_TEST_IMAGES", "")
-    images = Images(shared or f"skytether-test-{secrets.token_hex(4)}/", [], kept=bool(shared))
-    names = ["base", "guard", "virtual-trail"]
-    try:
-        images.rows.extend(build(images.prefix, *names))
-        folder = tmp_path_factory.mktemp("toy")
-        (folder / "Dockerfile").write_text(TOY)
-        command = ["docker", "build", "-q", "-t", images.toy, "--build-arg", f"BASE={images.name('base')}", str(folder)]
-        subprocess.run(command, check=True, capture_output=True, env={**os.environ, "DOCKER_BUILDKIT": "0"})
-        yield images
-    finally:
-        images.remove("toy", *reversed(names))
-        if not shared:
-            subprocess.run(
-                ["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"], capture_output=True
-            )
+    prefix = shared or f"skytether-test-{secrets.token_hex(4)}/"
+    folder = folder_of(tmp_path_factory)
+
+    def images(prefix: str, rows: list[dict[str, Any]]) -> Images:
+        return Images(prefix, rows, folder, kept=bool(shared))
+
+    def begin() -> str:
+        made = images(prefix, [])
+        made.build_all()
+        return json.dumps([prefix, made.rows])
+
+    with begun_once(folder, "images", begin, lambda: images(*json.loads(told)).remove_all()) as told:
+        yield images(*json.loads(told))
+
+
+@pytest.fixture(scope="session")
+def orchestrator_image(docker_images: Images) -> Iterator[str]:
+    """Its name; for tests that have it run on a cluster."""
+    with docker_images.another("orchestrator") as name:
+        yield name
 
 
 @pytest.fixture(scope="session")
@@ -510,12 +540,9 @@ def docker_site(_docker_network: DockerSite) -> Iterator[DockerSite]:
 
 
 @pytest.fixture(scope="session")
-def kubeconfig(docker_engine: str) -> Iterator[str]:
-    """The administrator's, of a real cluster whose pods run in the Docker engine, so that it has the same images.
+def _cluster(docker_engine: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    import node_sweeper
 
-    ``SKYTETHER_CLUSTER`` names the program that starts it (``up``, which prints the path) and stops it (``down``): it
-    takes a part of a processor, which other tests need.
-    """
     program = os.environ.get("SKYTETHER_CLUSTER", "")
     if not program:
         require("kubernetes", "SKYTETHER_CLUSTER does not name the program that starts a cluster for tests")
@@ -525,28 +552,53 @@ def kubeconfig(docker_engine: str) -> Iterator[str]:
         require("kubernetes", f"{disk.free / disk.total:.0%} of the engine's disk is free; a cluster's node wants 18 %")
     # Its proxy lets packets of loopback leave the machine, from then on; other tests count on the kernel's refusal.
     refusal = Path("/proc/sys/net/ipv4/conf/all/route_localnet")
-    before = refusal.read_text()
-    begun = subprocess.run([program, "up"], capture_output=True, text=True)
-    if begun.returncode:  # it fetches packages
+
+    def begin() -> str:
+        before = refusal.read_text().strip()
         begun = subprocess.run([program, "up"], capture_output=True, text=True)
-    if begun.returncode:
-        require("kubernetes", f"{program} up failed: {begun.stderr.strip()}")
-    yield begun.stdout.split()[-1]
-    subprocess.run([program, "down"], capture_output=True)
-    refusal.write_text(before)
+        if begun.returncode:  # it fetches packages
+            begun = subprocess.run([program, "up"], capture_output=True, text=True)
+        if begun.returncode:
+            require("kubernetes", f"{program} up failed: {begun.stderr.strip()}")
+        path = begun.stdout.split()[-1]
+        return f"{before} {path} {node_sweeper.begin(path)}"
+
+    def end() -> None:
+        before, _, sweeper = told.split()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(int(sweeper), signal.SIGTERM)
+        subprocess.run([program, "down"], capture_output=True)
+        refusal.write_text(before)
+
+    with begun_once(folder_of(tmp_path_factory), "cluster", begin, end) as told:
+        yield told.split()[1]
+
+
+@pytest.fixture
+def kubeconfig(
+    request: pytest.FixtureRequest, _cluster: str, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[str]:
+    """The administrator's, of a real cluster whose pods run in the Docker engine, so that it has the same images.
+
+    ``SKYTETHER_CLUSTER`` names the program that starts it (``up``, which prints the path) and stops it (``down``): it
+    takes a part of a processor, which other tests need. A test marked ``whole_cluster`` has it to itself.
+    """
+    alone = request.node.get_closest_marker("whole_cluster") is not None
+    with turn(folder_of(tmp_path_factory), "cluster", alone=alone):
+        yield _cluster
 
 
 @pytest.fixture(scope="session")
-def _kubernetes_namespace(docker_images: Images, kubeconfig: str) -> Iterator[KubernetesSite]:
+def _kubernetes_namespace(_cluster: str, docker_images: Images) -> Iterator[KubernetesSite]:
     from kubernetes_site import KubernetesSite
 
-    site = KubernetesSite(docker_images, kubeconfig)
+    site = KubernetesSite(docker_images, _cluster)
     yield site
     site.close()
 
 
 @pytest.fixture
-def kubernetes_site(_kubernetes_namespace: KubernetesSite) -> Iterator[KubernetesSite]:
+def kubernetes_site(kubeconfig: str, _kubernetes_namespace: KubernetesSite) -> Iterator[KubernetesSite]:
     """A site on the real cluster; what it has made is removed after each test."""
     _kubernetes_namespace.begin()
     yield _kubernetes_namespace

@@ -17,6 +17,7 @@ from docker_site import Images
 from helm_chart import OLDEST, Values, helm_python, objects
 from helm_release import PATIENCE, HelmRelease
 from kubernetes_house import be_driven
+from kubernetes_site import LITTLE
 from postgres_server import own_server
 from value_sets import SETS
 
@@ -31,9 +32,8 @@ _EVENTS = {"config": {"limits": {"events": 777}}}
 
 
 @pytest.fixture
-def images(docker_images: Images) -> Iterator[Images]:
-    with docker_images.another("orchestrator"), docker_images.another("virtual-trail"):
-        yield docker_images
+def images(docker_images: Images, orchestrator_image: str) -> Images:
+    return docker_images
 
 
 def catalog(images: Images) -> Values:
@@ -44,6 +44,7 @@ def catalog(images: Images) -> Values:
     document = manifests["virtual-trail"].model_dump(mode="json", by_alias=True)
     document["metadata"]["name"] = "trail"
     document["spec"] |= {"image": images.name("virtual-trail"), "entrypoint": None}
+    document["spec"]["needs"] |= LITTLE
     return {"catalog": {"trail": document}}
 
 
@@ -96,9 +97,15 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
 
         robots = [stack.enter_context(release.robot("walker")) for release in both]
         held = [release.ask(robot, "walker", "trail") for release, robot in zip(both, robots, strict=True)]
-        for robot, instance in zip(robots, held, strict=True):
-            assert instance.session is not None
-            be_driven(instance.session, robot.claim_session(instance.id, "0123456789abcdef"))
+        keys = [robot.claim_session(one.id, "0123456789abcdef") for robot, one in zip(robots, held, strict=True)]
+
+        def drive() -> None:
+            """A service that no robot is linked with for two minutes ends, and is begun anew."""
+            for one, key in zip(held, keys, strict=True):
+                assert one.session is not None
+                be_driven(one.session, key)
+
+        drive()
         assert held[1].session is not None
         assert held[1].session.port == _RELAY_PORT
         for release in both:
@@ -107,10 +114,12 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
         before, pods = first.secrets(), first.pods("skytether.io/owner=demo-cluster")
         orchestrator = first.pods("app.kubernetes.io/component=orchestrator")
         first.upgrade(_EVENTS)
+        drive()
         _is_as_before(first, before, pods, "walker")
         assert first.pods("app.kubernetes.io/component=orchestrator") != orchestrator, "what has changed is used"
         assert "events: 777" in first.kubectl("get", "configmap", "demo-skytether-orchestrator", "-o", "yaml")
         first.rollback()
+        drive()
         _is_as_before(first, before, pods, "walker")
         assert "events: 777" not in first.kubectl("get", "configmap", "demo-skytether-orchestrator", "-o", "yaml")
         assert first.revisions() == [1, 2, 3]
@@ -118,7 +127,7 @@ def test_a_release_drives_robots_outlives_its_upgrade_and_leaves_nothing(
         first.uninstall()
         assert first.left() == []
         beside = robots[1].get_instance(held[1].id)
-        assert beside.state == "running", beside
+        assert (beside.state, beside.restarts) == ("running", 0), beside
         assert second.pods("skytether.io/owner=demo-cluster"), "what belongs to the other is still there"
         second.uninstall()
         assert second.left() == []
@@ -201,7 +210,7 @@ def test_the_oldest_cluster_takes_what_is_rendered_for_it(values: str, kubeconfi
 )
 def test_what_is_wrong_is_refused_and_leaves_nothing(kubeconfig: str, values: dict[str, Any], says: str) -> None:
     name = f"skytether-chart-{secrets.token_hex(4)}"
-    release = HelmRelease(Images("none/", []), kubeconfig, name, {})
+    release = HelmRelease(Images("none/", [], Path()), kubeconfig, name, {})
     release.values = values
     with pytest.raises(helm_python.HelmError) as refused:
         release.install()

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from kubernetes_site import LITTLE
 
 from skytether.api.grant import GRANT_VARIABLE
-from skytether.orchestrator.runtimes.base import Runtime
+from skytether.orchestrator.runtimes.base import Launch, Runtime
 from skytether.orchestrator.runtimes.process import ProcessOptions, ProcessRuntime
 from skytether.orchestrator.runtimes.procfs import ProcessStat
 from skytether.testing.runtime_contract import RuntimeKit
@@ -68,6 +70,11 @@ class KubernetesKit(RuntimeKit):
         runtime = self.site.open(self.folder)
         self.runtimes.append(runtime)
         return runtime
+
+    def launch(self, instance: str = "i1", attempt: int = 1, behaviour: str = "good") -> Launch:
+        asked = super().launch(instance, attempt, behaviour)
+        needs = asked.spec.needs.model_copy(update=LITTLE)
+        return replace(asked, spec=asked.spec.model_copy(update={"needs": needs}))
 
     def running(self, instance: str = "i1") -> int:
         pods = self.site.there("pods", f"skytether.io/instance={instance}")

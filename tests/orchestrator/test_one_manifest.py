@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from docker_runs import until
 from docker_site import DockerSite
 from kubernetes_house import OPERATOR, House
 from kubernetes_site import KubernetesSite
@@ -42,7 +43,8 @@ def test_one_manifest_runs_on_a_machine_on_an_engine_and_on_a_cluster(
         ward = SiteCreate(name="ward", tier="edge", runtime="kubernetes", options=kubernetes_site.options())
         house.core.sites.delete("ward")
         for site in (lab, edge, ward):  # each is cheaper than those before
-            house.core.sites.add(site)
+            added = house.core.sites.add(site)
+            until(lambda: not added.unreachable)  # noqa: B023
             instance = house.ask("virtual-trail")
             assert house.until(instance, State.RUNNING).site == site.name
             house.drive(instance)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from docker_site import DockerSite
-from kubernetes_site import KubernetesSite
+from kubernetes_site import LITTLE, KubernetesSite
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
@@ -24,6 +24,8 @@ PYTHON = "/app/bin/python"
 
 def launch(site: DockerSite | KubernetesSite, instance: str = "i1", attempt: int = 1, **more: Any) -> Launch:
     params, image = more.pop("params", {}), more.pop("image", site.images.toy)
+    if isinstance(site, KubernetesSite):
+        more["needs"] = {**LITTLE, **more.get("needs", {})}
     grant = Grant(
         instance=instance,
         service="toy",

@@ -11,7 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+from one_run import begun_once
 
 from skytether.orchestrator.runtimes.docker import DockerOptions, DockerRuntime
 from skytether.orchestrator.runtimes.docker.options import LOCAL_SOCKET
@@ -28,6 +31,10 @@ def build(prefix: str, *names: str) -> list[dict[str, Any]]:
     return rows
 
 
+COMMON = ("base", "guard", "virtual-trail")
+"""The images that all tests with an engine have, beside the toy."""
+
+
 @dataclass(frozen=True)
 class Images:
     """The images of one run of the tests, removed at its end, unless the next run is to have them."""
@@ -35,6 +42,8 @@ class Images:
     prefix: str
     rows: list[dict[str, Any]]
     """What ``images/build.py --json`` told of them."""
+    folder: Path
+    """Which all processes of the run have."""
     kept: bool = False
 
     @property
@@ -58,14 +67,31 @@ class Images:
         if self.name(image) in [row["image"] for row in self.rows]:
             yield self.name(image)
             return
-        build(self.prefix, image)
-        yield self.name(image)
-        self.remove(image)
+
+        def begin() -> str:
+            build(self.prefix, image)
+            return image
+
+        with begun_once(self.folder, image, begin, lambda: self.remove(image)):
+            yield self.name(image)
+
+    def build_all(self) -> None:
+        """What all tests have; of that nothing is left if it fails."""
+        try:
+            self.rows.extend(build(self.prefix, *COMMON))
+            with TemporaryDirectory() as folder:
+                (Path(folder) / "Dockerfile").write_text(TOY)
+                command = ["docker", "build", "-q", "-t", self.toy, "--build-arg", f"BASE={self.name('base')}", folder]
+                environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
+                subprocess.run(command, check=True, capture_output=True, env=environment)
+        except BaseException:
+            self.remove_all()
+            raise
 
     @contextmanager
     def apart(self, image: str) -> Iterator[Images]:
         """Guard and one image under names of their own: a container of it is of who has these, whoever else is here."""
-        own = Images(f"{self.prefix}{secrets.token_hex(4)}/", [])
+        own = Images(f"{self.prefix}{secrets.token_hex(4)}/", [], self.folder)
         recipe = f"FROM {self.name(image)}\nLABEL apart={own.prefix}\n"
         command = ["docker", "build", "-q", "-t", own.name(image), "-"]
         environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
@@ -80,6 +106,13 @@ class Images:
         """Remove them from the engine, with the layers that are nobody else's."""
         if not self.kept:
             subprocess.run(["docker", "image", "rm", "-f", *map(self.name, images)], capture_output=True)
+
+    def remove_all(self) -> None:
+        """Of what all tests have, and what is left of making it."""
+        if not self.kept:
+            self.remove("toy", *reversed(COMMON))
+            prune = ["docker", "image", "prune", "-f", "--filter", "label=skytether.io/stage"]
+            subprocess.run(prune, capture_output=True)
 
 
 TOY = """\

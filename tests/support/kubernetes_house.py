@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from kubernetes_site import KubernetesSite
+from kubernetes_site import LITTLE, KubernetesSite
 
 from skytether.api.manifest import Manifest
 from skytether.api.rest import InstanceCreate, Session, SiteCreate, State
@@ -64,7 +64,7 @@ class House:
     def put_trail(self, image: str) -> None:
         """The manifest of ``virtual-trail``, under the name ``trail`` and with this image."""
         shipped = self.core.catalog.get("virtual-trail").spec.model_dump(mode="json")
-        self.put("trail", **shipped | {"image": image, "entrypoint": None})
+        self.put("trail", **shipped | {"image": image, "entrypoint": None, "needs": shipped["needs"] | LITTLE})
 
     def drive(self, instance: str) -> Session:
         """Be its robot until it has sent a velocity: somebody leans on the walker. Where it was reached."""

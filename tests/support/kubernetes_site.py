@@ -16,6 +16,9 @@ from docker_site import Images
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.options import KubernetesOptions
 
+LITTLE = {"cpu": 0.05}
+"""What services of tests need: all have one node of two cores together, and a pod counts until it is gone."""
+
 
 class KubernetesSite:
     """Kubernetes sites of the tests, in a namespace of their own, and nothing left of them at the end."""

@@ -438,6 +438,7 @@ class TwoLeadersContract:
         first.lead(1)
         for instance in ("removed", "anew", "stays"):
             first.start(kit.launch(instance))
+        for instance in ("removed", "anew", "stays"):
             kit.until(first, Phase.RUNNING, instance)
         second.lead(2)
         for instance in ("removed", "anew", "stays"):

@@ -210,7 +210,7 @@ sys.path.insert(0, sys.argv[1])
 from docker_runs import launch
 from docker_site import DockerSite, Images
 
-site = DockerSite(Images(sys.argv[3], []))
+site = DockerSite(Images(sys.argv[3], [], Path()))
 site.network, site.owner = sys.argv[4:6]
 runtime = site.open(Path(sys.argv[2]))
 runtime.lead(1)

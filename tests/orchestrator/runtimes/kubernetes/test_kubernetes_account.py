@@ -124,9 +124,9 @@ class InCluster:
 
 
 @pytest.fixture
-def inside(kubernetes_site: KubernetesSite) -> Iterator[InCluster]:
+def inside(kubernetes_site: KubernetesSite, orchestrator_image: str) -> Iterator[InCluster]:
     kubernetes_site.give_account(kubernetes_site.role("skytether"))
-    with kubernetes_site.images.another("orchestrator") as image, closing(InCluster(kubernetes_site, image)) as inside:
+    with closing(InCluster(kubernetes_site, orchestrator_image)) as inside:
         yield inside
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from kubernetes_site import KubernetesSite
+from kubernetes_site import LITTLE, KubernetesSite
 
 from skytether.api.client import Client
 from skytether.api.rest import RobotCreate, SiteCreate, State
@@ -21,7 +21,7 @@ from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.command import Source
 
-pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
+pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes, pytest.mark.whole_cluster]
 
 
 def until(condition: Callable[[], Any]) -> Any:
@@ -36,7 +36,8 @@ def test_a_drain_waits_until_the_robot_has_been_handed_over(kubernetes_site: Kub
     kubectl, space = kubernetes_site.kubectl, ("-n", kubernetes_site.namespace)
     with EmbeddedOrchestrator() as orchestrator, Client(orchestrator.url, orchestrator.operator_token) as operator:
         manifest = operator.get_service(SERVICE)
-        spec = manifest.spec.model_copy(update={"image": kubernetes_site.images.name(SERVICE)})
+        needs = manifest.spec.needs.model_copy(update=LITTLE)
+        spec = manifest.spec.model_copy(update={"image": kubernetes_site.images.name(SERVICE), "needs": needs})
         operator.put_service(SERVICE, manifest.model_copy(update={"spec": spec}))
         options = kubernetes_site.options()
         operator.create_site(SiteCreate(name="ward", tier="edge", runtime="kubernetes", options=options))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from kubernetes_house import OPERATOR, House
-from kubernetes_site import KubernetesSite
+from kubernetes_site import LITTLE, KubernetesSite
 
 from skytether.api.rest import State
 
@@ -32,7 +32,7 @@ def test_a_robot_outside_is_driven_by_a_pod(house: House) -> None:
 
 
 def test_an_instance_outlives_the_orchestrator_and_is_started_again_when_its_pod_is_deleted(house: House) -> None:
-    house.put("toy", image=house.site.images.toy, params={"additionalProperties": True})
+    house.put("toy", image=house.site.images.toy, params={"additionalProperties": True}, needs=LITTLE)
     instance = house.ask("toy")
     before = house.until(instance, State.RUNNING)
     pods = [one["metadata"]["uid"] for one in house.site.there("pods")]

@@ -115,6 +115,7 @@ def told(runtime: Any, site: KubernetesSite, words: str) -> bool:
     return False
 
 
+@pytest.mark.whole_cluster
 def test_a_taint_is_named_where_it_keeps_pods_away(kubernetes_site: KubernetesSite, tmp_path: Path) -> None:
     node = kubernetes_site.kubectl("get", "nodes", "-o", "jsonpath={.items[0].metadata.name}")
     sized = {"cpu": 2, "memory_mb": 1024}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import yaml
 from docker_runs import launch
 from kubernetes_site import KubernetesSite
 
-from skytether.orchestrator.runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure
+from skytether.orchestrator.runtimes.base import Observation, OvertakenError, Phase, RuntimeFailure, SiteSilentError
 from skytether.orchestrator.runtimes.kubernetes import KubernetesRuntime
 from skytether.orchestrator.runtimes.kubernetes.objects import pod
 
@@ -107,7 +107,14 @@ def test_a_run_that_was_made_and_not_begun_is_removed_by_who_leads_next(
         runtime.lead(2)
         assert runtime.observe() == {}
         until(lambda: kubernetes_site.there("pods") == [])
-        runtime.start(launch(kubernetes_site))
+
+        def begun() -> bool:
+            with suppress(SiteSilentError):  # the one that is removed has its name, until it is gone
+                runtime.start(launch(kubernetes_site))
+                return True
+            return False
+
+        until(begun)
         until_seen(runtime, lambda seen: seen.phase is Phase.RUNNING)
         for act in (lambda: late.start(launch(kubernetes_site, "i2")), lambda: late.remove("i1"), lambda: late.lead(1)):
             with pytest.raises(OvertakenError):
