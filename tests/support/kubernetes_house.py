@@ -79,7 +79,7 @@ class House:
             record = self.core.instances.get(OPERATOR, instance)
             if record.state is state and good(record):
                 return record
-            assert time.monotonic() < deadline, f"{record.state}: {record.reason}"
+            assert time.monotonic() < deadline, f"{record.state}, attempt {record.attempt}: {record.reason}"
             time.sleep(0.02)
 
 
