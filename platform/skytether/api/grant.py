@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from .manifest import GraphKind, Strict, TopicSpec
+from .manifest import ServiceGraph, Strict, TopicSpec
 
 GRANT_VARIABLE = "SKYTETHER_GRANT"
 DEFAULT_GRANT_PATH = "/run/skytether/grant.json"
@@ -30,7 +30,7 @@ class Grant(Strict):
     topics: tuple[TopicSpec, ...]
     launch: str | None = None
     """Of a service with a ROS graph of its own: its launch file, see the manifest."""
-    graph: GraphKind = "ros1"
+    graph: ServiceGraph = "ros1"
     """Of such a service: the generation."""
     remap: dict[str, str] = {}
     """Of such a service: names in its graph."""

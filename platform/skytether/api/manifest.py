@@ -24,7 +24,7 @@ Egress = Annotated[
 ANY_TOPIC = "*"
 RELIABLE_LIFESPAN_MS = 60_000
 """How long a reliable topic tries by default."""
-GraphKind = Literal["ros1", "ros2"]
+ServiceGraph = Literal["ros1", "ros2"]
 GRAPH_ENTRYPOINTS: dict[str, str] = {"ros1": "skytether.service.ros1", "ros2": "skytether.service.ros2"}
 """What a service with a ROS graph of its own runs, by generation."""
 CALL_DEPTH = 64
@@ -296,7 +296,7 @@ class ServiceSpec(Strict):
     """Container image; needed by container sites."""
     entrypoint: str | None = None
     """Python module with a ``__main__``; needed by process sites."""
-    graph: GraphKind | None = None
+    graph: ServiceGraph | None = None
     """``ros1`` or ``ros2``: a ROS graph of its own, with unchanged nodes: ``launch`` says which. The entry point is
     then ``skytether.service.ros1`` (or ``ros2``) unless another is named, and the image one made on
     ``skytether/ros1-base`` (or ``ros2-base``)."""

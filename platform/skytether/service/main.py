@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from pydantic import ValidationError
 
 from skytether.api.grant import DEFAULT_GRANT_PATH, GRANT_VARIABLE, Grant
-from skytether.api.manifest import GraphKind
+from skytether.api.manifest import ServiceGraph
 from skytether.api.service_report import FILE_NAME
 from skytether.messages import warm
 from skytether.wire.topic import Role
@@ -75,7 +75,7 @@ def read_grant(environ: Mapping[str, str]) -> Grant:
         raise ConfigError(f"the grant {path} is wrong: {text}") from None
 
 
-def check_graph(grant: Grant, kind: GraphKind | None) -> None:
+def check_graph(grant: Grant, kind: ServiceGraph | None) -> None:
     """See that the manifest asks for what runs here: a graph of this kind, or none.
 
     Raises:

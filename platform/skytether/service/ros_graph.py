@@ -25,7 +25,7 @@ from types import FrameType
 from typing import Protocol
 
 from skytether.api.grant import Grant
-from skytether.api.manifest import GraphKind
+from skytether.api.manifest import ServiceGraph
 from skytether.bridge import Bridge, BridgeError, SessionSpec
 from skytether.bridge.port import Port
 from skytether.bridge.spec import parse_id, parse_key, topics_from_api
@@ -128,7 +128,7 @@ class GraphType:
         join: Sets the graph up, for as long as the context lasts.
     """
 
-    kind: GraphKind
+    kind: ServiceGraph
     ros: Generation
     encoding: Encoding
     rows: Sequence[Topic]

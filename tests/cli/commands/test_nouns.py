@@ -73,7 +73,10 @@ def test_a_service_from_file_to_log(run: Run, tmp_path: Path) -> None:
     assert yaml.safe_load(shown)["service"] == "toy"
     assert "key" not in yaml.safe_load(shown)["session"]
     assert made["id"] in [i["id"] for i in good(run("instance", "list", "--json"))]
-    assert made["id"] in run("instance", "list").stdout
+    header, row, *_ = run("instance", "list").stdout.splitlines()
+    shown = [made["id"], "walker", "toy", "running", "local", "0"]
+    columns = ["instance", "robot", "service", "state", "site", "restarts"]
+    assert [row[header.index(column) :].split()[0] for column in columns] == shown
     assert run("instance", "logs", made["id"]).stdout == "hello [there]\n"
     assert good(run("instance", "logs", made["id"], "--json"))["lines"] == ["hello [there]"]
     resized = good(run("instance", "resize", made["id"], "--cpu", "0.5", "--memory", "200", "--json"))

@@ -1,4 +1,4 @@
-"""What a runtime is: six calls, and what each of them means.
+"""What a runtime is, and what each of its calls means.
 
 A runtime starts, stops and observes instances on one site. It decides nothing: when to start again, how long to wait
 for an end, what to do with strangers is the reconciler's. All calls come from the site's own thread, except ``logs``,

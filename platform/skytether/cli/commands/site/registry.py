@@ -52,7 +52,9 @@ def show_site(name: SiteName, url: Url = None, token_file: TokenFile = None, jso
 
 def add_site(
     name: str,
-    runtime: Annotated[str, typer.Option(help="What starts instances there: process, docker.")],
+    runtime: Annotated[
+        str, typer.Option(help="What starts instances there: process, docker, kubernetes, or one that is installed.")
+    ],
     tier: Annotated[str, typer.Option(help="robot, edge or cloud.")] = "edge",
     option: Annotated[
         list[str] | None, typer.Option(help="KEY=VALUE of the runtime's options; may be given again.")
