@@ -1,7 +1,7 @@
 import pytest
 
 from skytether.api.manifest import TopicSpec
-from skytether.ros.names import GraphNameError, Names, bridge_type, check_name, legal_type, namespace_of, ros1_type
+from skytether.ros.names import GraphNameError, Names, bridge_type, check_name, namespace_of, ros1_type
 
 
 def spec(name, direction="in", **more):
@@ -15,7 +15,7 @@ def test_ros1_takes_these_names(name):
 
 @pytest.mark.parametrize("name", ["_scan", "3d", "", "/a//b", "/a/", "a b", "ä", "-x", "x" * 256])
 def test_ros1_refuses_these_names(name):
-    with pytest.raises(GraphNameError, match="no name of a graph"):
+    with pytest.raises(GraphNameError, match="not a valid name of a graph"):
         check_name(name)
 
 
@@ -37,10 +37,6 @@ def test_types_of_ros_1_and_of_manifests():
     assert bridge_type("sensor_msgs/LaserScan") == "sensor_msgs/msg/LaserScan"
     assert bridge_type("std_srvs/SetBool", "srv") == "std_srvs/srv/SetBool"
     assert bridge_type("sensor_msgs/msg/LaserScan") == "sensor_msgs/msg/LaserScan"
-    assert legal_type("a_b/msg/C1")
-    assert legal_type("a/C")
-    assert not legal_type("LaserScan")
-    assert not legal_type("*")
 
 
 def test_what_a_robot_sends_is_under_its_namespace_and_what_a_service_sends_under_the_service_s():

@@ -405,6 +405,6 @@ def _at(kind: str, name: str, what: str = "") -> str:
         ApiError: It is none.
     """
     if not PATH_NAME.fullmatch(name):
-        detail = f"{name!r} is no name of anything: names are letters, digits, '-' and '_'"
+        detail = f"{name!r} is not a valid name: names are letters, digits, '-' and '_'"
         raise ApiError(Problem(title="Not found", status=404, detail=detail))
     return f"/{kind}/{name}/{what}" if what else f"/{kind}/{name}"

@@ -26,7 +26,7 @@ from skytether.robot.agent.config import AgentConfig
 
 from .embedded import EmbeddedOrchestrator
 from .nine_goals import LIMITS, ROBOT, SERVICE
-from .trial.rig import TrialError
+from .trial.errors import TrialError
 from .world.agent import Clockwork, WorldGraph, WorldHardware
 from .world.contacts import Contact
 from .world.guide import Guide

@@ -23,8 +23,9 @@ from .follow_in_front_report import IMAGE, LASER, POSE, SCAN, SONAR
 from .follow_in_front_result import FollowResult, FollowTraces
 from .measures import kinematic_tracking_error
 from .throttle import native_threads_time
+from .trial.errors import TrialError
 from .trial.results import Measured, Point, rounded
-from .trial.rig import Drive, Rig, Status, Task, TrialError
+from .trial.rig import Drive, Rig, Status, Task
 from .trial.scenario import ROBOT_CPU, Scenario, TrialSettings
 from .world.camera import Camera
 from .world.lemniscate import Lemniscate

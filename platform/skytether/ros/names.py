@@ -17,7 +17,6 @@ Generation = Literal[1, 2]
 MAX_NAME = 255
 
 _LEGAL = {1: re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*"), 2: re.compile(r"[A-Za-z_/~][A-Za-z0-9_/]*")}
-_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/(msg|srv|action))?/[A-Za-z][A-Za-z0-9_]*")
 
 
 class GraphNameError(ValueError):
@@ -34,16 +33,16 @@ def check_name(name: str, ros: Generation = 1) -> str:
         GraphNameError: It does not allow it.
     """
     if not name or len(name) > MAX_NAME:
-        raise GraphNameError(f"'{name[:40]}' is no name of a graph: it must have 1 to {MAX_NAME} characters")
+        raise GraphNameError(f"'{name[:40]}' is not a valid name of a graph: it must have 1 to {MAX_NAME} characters")
     if not _LEGAL[ros].fullmatch(name):
         first = "a letter, '/' or '~'" if ros == 1 else "a letter, '_', '/' or '~'"
         raise GraphNameError(
-            f"'{name}' is no name of a graph: it must begin with {first}, then letters, digits, '_' and '/'"
+            f"'{name}' is not a valid name of a graph: it must begin with {first}, then letters, digits, '_' and '/'"
         )
     if "//" in name or (name.endswith("/") and name != "/"):
-        raise GraphNameError(f"'{name}' is no name of a graph: something must follow each '/'")
+        raise GraphNameError(f"'{name}' is not a valid name of a graph: something must follow each '/'")
     if ros == 2 and any(token[:1].isdigit() for token in name.split("/")):
-        raise GraphNameError(f"'{name}' is no name of a ROS 2 graph: no part may begin with a digit")
+        raise GraphNameError(f"'{name}' is not a valid name of a ROS 2 graph: no part may begin with a digit")
     return name
 
 
@@ -70,11 +69,6 @@ def bridge_type(name: str, kind: Literal["msg", "srv"] = "msg") -> str:
     """``sensor_msgs/LaserScan`` as manifests and tables have it: ``sensor_msgs/msg/LaserScan``."""
     package, _, rest = name.partition("/")
     return name if "/" in rest or not rest else f"{package}/{kind}/{rest}"
-
-
-def legal_type(name: str) -> bool:
-    """Whether it is a package and a type's name."""
-    return _TYPE.fullmatch(name) is not None
 
 
 class Names:

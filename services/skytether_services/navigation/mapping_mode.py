@@ -51,7 +51,7 @@ class MappingMode:
             executor: Of one thread.
 
         Raises:
-            ValueError: ``save_as`` is no name for files.
+            ValueError: ``save_as`` is not a valid file name.
         """
         name = params.mapping.save_as
         if not name or name.startswith(".") or Path(name).name != name:

@@ -74,9 +74,9 @@ def test_a_service_from_file_to_log(run: Run, tmp_path: Path) -> None:
     assert "key" not in yaml.safe_load(shown)["session"]
     assert made["id"] in [i["id"] for i in good(run("instance", "list", "--json"))]
     header, row, *_ = run("instance", "list").stdout.splitlines()
-    shown = [made["id"], "walker", "toy", "running", "local", "0"]
-    columns = ["instance", "robot", "service", "state", "site", "restarts"]
-    assert [row[header.index(column) :].split()[0] for column in columns] == shown
+    columns = ("instance", "robot", "service", "state", "site", "restarts")
+    cells = [row[header.index(column) :].split()[0] for column in columns]
+    assert cells == [made["id"], "walker", "toy", "running", "local", "0"]
     assert run("instance", "logs", made["id"]).stdout == "hello [there]\n"
     assert good(run("instance", "logs", made["id"], "--json"))["lines"] == ["hello [there]"]
     resized = good(run("instance", "resize", made["id"], "--cpu", "0.5", "--memory", "200", "--json"))
@@ -134,7 +134,7 @@ def test_files_are_applied_all_or_none_and_as_often_as_one_likes(run: Run, tmp_p
     assert "there is no service 'b1'" in bad(run("service", "show", "b1"))
     twice = written(tmp_path / "twice.yaml", named("a1"))
     assert f"service 'a1' is in {twice} already" in bad(run("apply", "-f", twice, "-f", twice), 2)
-    assert "'A/1' is no name" in bad(run("apply", "-f", written(tmp_path / "name.yaml", named("A/1"))), 2)
+    assert "'A/1' is not a valid name" in bad(run("apply", "-f", written(tmp_path / "name.yaml", named("A/1"))), 2)
     (tmp_path / "empty").mkdir()
     assert "holds no *.yaml" in bad(run("apply", "-f", str(tmp_path / "empty")), 2)
     assert bad(run("apply", "-f", "-", stdin=": ["), 2).startswith("standard input: is no YAML")
@@ -210,7 +210,7 @@ def test_a_wrong_file_is_one_sentence(run: Run, tmp_path: Path, text: str | None
         (["token", "create", "R!", "--scope", "read"], 2, "name: string should match pattern"),
         (["instance", "create", "toy", "--robot", "r", "--params", "{"], 2, "--params is no JSON"),
         (["instance", "create", "toy", "--robot", "r", "--params", "[]"], 2, "params: must be a mapping"),
-        (["robot", "add", "R!"], 2, "'R!' is no name"),
+        (["robot", "add", "R!"], 2, "'R!' is not a valid name"),
         (["site", "list", "--token-file", "/nowhere"], 2, "there is no token file /nowhere"),
         (
             ["site", "list", "--url", "http://127.0.0.1:1"],

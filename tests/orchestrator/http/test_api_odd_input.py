@@ -104,7 +104,7 @@ def test_a_name_that_is_a_path_leads_nowhere_else(served: Any) -> None:
             operator.rotate_token,
             operator.delete_token,
         ):
-            with pytest.raises(ApiError, match="is no name of anything") as caught:
+            with pytest.raises(ApiError, match="is not a valid name") as caught:
                 ask(name)
             assert caught.value.problem.status == 404
     assert (operator.robots(), operator.services(), operator.tokens(), [s.name for s in operator.sites()]) == before

@@ -73,15 +73,15 @@ ros1:
         ("ros2: {rooter: tcp/x:1}", "ros2.rooter: unknown key, did you mean 'router'"),
         ("ros2: {router: localhost}", "ros2.router"),
         ("ros2: {cmd_vel_type: geometry_msgs/msg/Pose}", "ros2.cmd_vel_type"),
-        ("ros2: {cmd_vel: base/3d}", "cmd_vel: 'base/3d' is no name of a ROS 2 graph"),
+        ("ros2: {cmd_vel: base/3d}", "cmd_vel: 'base/3d' is not a valid name of a ROS 2 graph"),
         ("ros1: {mastr: http://x}", "ros1.mastr: unknown key, did you mean 'master'"),
         ("ros1: {master: localhost}", "ros1.master: must be an address such as http://"),
         ("ros1: {}\nservise: x", "servise: unknown key, did you mean 'service'"),
         ("ros1: {}\nlimits: {linear_mx: 1}", "linear_mx: unknown key, did you mean 'linear_max'"),
         ("ros1: {}\nlimits: {linear_max: .nan}", "limits.linear_max: input should be a finite number"),
         ("ros1: {}\nlimits: {linear_max: .inf}", "limits.linear_max: input should be a finite number"),
-        ("ros1: {remap: {scan: 3 d}}", "remap.scan: '3 d' is no name of a graph"),
-        ("ros1: {params: ['/a//b']}", "params.0: '/a//b' is no name"),
+        ("ros1: {remap: {scan: 3 d}}", "remap.scan: '3 d' is not a valid name of a graph"),
+        ("ros1: {params: ['/a//b']}", "params.0: '/a//b' is not a valid name"),
         ("ros1: {readings: {force: std_msgs/msg/Nothing}}", "ros1.readings: force: no message type"),
         ("ros1: {idle_s: 0}", "ros1.idle_s"),
         ("ros1: {}\nparams: {speeds: [1, .nan]}", "params: speeds.1: must be a finite number, not nan"),
@@ -147,7 +147,7 @@ def test_what_is_safety_s_cannot_be_listed(read, name, access):
 
 
 def test_a_name_that_is_none_cannot_be_listed(read):
-    with pytest.raises(ConfigError, match=r"cloud\.publish\.0.*no name of a graph"):
+    with pytest.raises(ConfigError, match=r"cloud\.publish\.0.*not a valid name of a graph"):
         read(GATED + "cloud: {publish: [/a//b]}")
 
 

@@ -161,8 +161,11 @@ def test_a_topic_of_another_type_is_left_out_with_both_sums_named_and_the_others
     wrong = talker.advertise("/walker/chat", "std_msgs/Bool", "8b94c1b53db61fb6aed406028ad6332a", latched=True)
     right = talker.advertise("/walker/more", STRING, MD5, latched=True)
     wrong.publish(b"\x01")
-    right.publish(string("fine"))
     wait_for(lambda: "topic /walker/chat: /other publishes std_msgs/Bool" in caplog.text, "the complaint")
+    wait_for(
+        lambda: "/skytether" in right.subscribers and listener.publishers_by_topic()["/walker/more"][0], "both ends"
+    )
+    right.publish(string("fine"))
     assert "8b94c1b53db61fb6aed406028ad6332a" in caplog.text
     assert MD5 in caplog.text
     wait_for(lambda: more == [string("fine")], "the right one")

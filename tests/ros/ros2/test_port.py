@@ -168,7 +168,7 @@ def test_a_service_of_a_ros2_graph_takes_any_topic(stage, ends):
     bridge = ends.start(Role.ROBOT, offered, robot.port, listening.address)
     stage.until(lambda: bridge.publish("odd", stage.cdr_string("x")) and heard.samples, "nothing came")
     assert heard.payloads[0] == stage.cdr_string("x")
-    assert "'/bot/not a name' is no name of ROS 2" in port.refusals["not a name"]
+    assert "'/bot/not a name' is not a valid name of ROS 2" in port.refusals["not a name"]
 
 
 def test_a_service_of_a_ros2_graph_takes_a_topic_whose_type_comes_late(stage):
@@ -277,7 +277,7 @@ def test_a_hash_in_the_row_is_taken_for_topics_and_calls(stage):
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        ({"name": "a b", "type": STRING}, "topic 'a b': '/a b' is no name of ROS 2"),
+        ({"name": "a b", "type": STRING}, "topic 'a b': '/a b' is not a valid name of ROS 2"),
         ({"name": "a", "type": "String"}, "topic 'a': 'String' is no type of ROS 2"),
         ({"name": "a", "kind": "call", "type": "Ask"}, "topic 'a': 'Ask' is no type of ROS 2"),
     ],

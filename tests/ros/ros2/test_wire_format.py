@@ -239,7 +239,7 @@ def test_names():
     assert full_name("/scan", "/bot") == "/scan"
     assert full_name("nav/_action/feedback") == "/nav/_action/feedback"
     for wrong in ("", "a b", "a//b", "/a/", "3po", "a/*", "a/%"):
-        with pytest.raises(ValueError, match="is no name of ROS 2"):
+        with pytest.raises(ValueError, match="is not a valid name of ROS 2"):
             full_name(wrong)
     for wrong in ("String", "std_msgs/String", "std_msgs/msg/", "*", "a/msg/B/c"):
         with pytest.raises(ValueError, match="is no type of ROS 2"):

@@ -115,9 +115,7 @@ def _read(files: list[Path]) -> list[_Document]:
             if name is None:
                 wrong.append(f"{where}: metadata.name: is missing")
             elif not NAME.fullmatch(name):
-                wrong.append(
-                    f"{where}: metadata.name: '{name}' is no name: lower-case letters, digits and '-', at most 63"
-                )
+                wrong.append(f"{where}: metadata.name: '{name}' is not a valid name: a-z, digits and '-', at most 63")
             elif twin is not None:
                 wrong.append(f"{where}: service '{name}' is in {twin} already")
             else:

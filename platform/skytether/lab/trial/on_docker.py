@@ -16,7 +16,7 @@ from skytether.orchestrator.runtimes.docker.network import remove_network
 from skytether.orchestrator.runtimes.docker.objects import OWNER
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
-from .rig import TrialError
+from .errors import TrialError
 from .scenario import TrialSettings
 
 

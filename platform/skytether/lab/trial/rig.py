@@ -30,6 +30,7 @@ from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
 from skytether.robot.control.supervisor import VelocityLimits
 
+from .errors import TrialError
 from .results import Measured, TopicRow
 from .scenario import TrialSettings
 from .tracker import Tracker
@@ -37,10 +38,6 @@ from .tracker import Tracker
 _LOOK_S = 0.05
 Status = Mapping[str, Any]
 """What a service says on its topic ``status``."""
-
-
-class TrialError(Exception):
-    """A trial could not begin, or leaves something behind; the text says why, in one sentence."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -329,7 +329,7 @@ class Settings(Group):
     def _names(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         for host in hosts:
             if not is_name(host):
-                raise ValueError(f"'{host}' is no name such as cloud.example.org or *.example.org: without a port")
+                raise ValueError(f"'{host}' is not a name such as cloud.example.org or *.example.org: without a port")
         return hosts
 
     @field_validator("advertise")

@@ -1,4 +1,4 @@
-"""How many requests who may make: token buckets, bounded in number. Pure."""
+"""How many requests who may make: token buckets, bounded in number. Safe from any thread."""
 
 from __future__ import annotations
 

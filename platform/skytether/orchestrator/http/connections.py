@@ -109,8 +109,8 @@ class ConnectionTable:
 
     def stranger(self) -> Connection | None:
         """Of the address with most connections without a token, the one that has been here for the longest."""
-        crowd = max(self._strangers.values(), key=len, default=None)
-        return next(iter(crowd)) if crowd else None
+        of_address = max(self._strangers.values(), key=len, default=None)
+        return next(iter(of_address)) if of_address else None
 
     def is_alone(self, connection: Connection) -> bool:
         """Whether its address has no other connection."""
@@ -150,11 +150,11 @@ class ConnectionTable:
             del self._at[connection.address]
 
     def _forget_stranger(self, connection: Connection) -> None:
-        crowd = self._strangers.get(connection.address)
-        if crowd is not None and connection in crowd:
-            del crowd[connection]
+        of_address = self._strangers.get(connection.address)
+        if of_address is not None and connection in of_address:
+            del of_address[connection]
             self._strange -= 1
-            if not crowd:
+            if not of_address:
                 del self._strangers[connection.address]
 
     def _forget_owner(self, connection: Connection) -> None:
@@ -381,7 +381,7 @@ class Acceptor:
         address, proxy = place_of(host), self._is_proxy(host)
         has_room, gives_way = self.table.room(address, free=proxy)
         if gives_way is not None:
-            if self.table.is_alone(gives_way):  # no crowd: it may have been a robot about to renew
+            if self.table.is_alone(gives_way):  # alone of its address: it may have been a robot about to renew
                 self._overload.note()
             self._end(gives_way)
         if not has_room:

@@ -57,5 +57,5 @@ def echo_answers(host: str, port: int) -> bool:
     try:
         with EchoClient(host, port) as client:
             return any(client.ask(ASK_S) is not None for _ in range(_TRIES))
-    except (OSError, UnicodeError):  # UnicodeError: it is no name that could be looked up
+    except (OSError, UnicodeError):  # UnicodeError: not a name that could be looked up
         return False

@@ -1,7 +1,7 @@
 """A PostgreSQL server that hangs: its connections stay open, and whoever waits for an answer would wait for ever.
 
-Keepalives and ``tcp_user_timeout`` (see ``db.py``) notice a machine or a network that is gone. A server that is frozen,
-or waits for its disk, is not noticed so: its kernel goes on acknowledging.
+Keepalives and ``tcp_user_timeout`` (see ``engine.py``) notice a machine or a network that is gone. A server that is
+frozen, or waits for its disk, is not noticed so: its kernel goes on acknowledging.
 """
 
 from __future__ import annotations

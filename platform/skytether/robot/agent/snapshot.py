@@ -63,7 +63,7 @@ class AgentStatus:
 
 def report(
     driver: ControlStatus | None,
-    tally: CounterTotals,
+    totals: CounterTotals,
     stats: SessionStats | None,
     rtt: float,
     *,
@@ -76,7 +76,7 @@ def report(
 
     Args:
         driver: What the control loop knows; None: there is none.
-        tally: What all sessions counted.
+        totals: What all sessions counted.
         stats: The present session's, for delays.
         rtt: Round trip [s]; NaN: not known.
         load: Share of the robot's processors that is busy; NaN: not known.
@@ -86,9 +86,9 @@ def report(
     """
     present = {(topic.topic, topic.direction): topic for topic in (stats.topics if stats else ())}
     # Those of the present session before others: of services before it there may be any number.
-    sums = sorted(tally.sums().items(), key=lambda one: one[0] not in present)[: rest.MOST_TOPICS]
+    sums = sorted(totals.sums().items(), key=lambda one: one[0] not in present)[: rest.MOST_TOPICS]
     return rest.Report(
-        life=tally.life,
+        life=totals.life,
         rtt_s=_known(rtt),
         topics=tuple(
             rest.TopicReport(

@@ -18,7 +18,7 @@ def full_name(name: str, namespace: str = "/") -> str:
     full = name if name.startswith("/") else f"{namespace.rstrip('/')}/{name}"
     if not _TOPIC.fullmatch(full):
         raise ValueError(
-            f"'{full}' is no name of ROS 2: parts of letters, digits and '_', none with a digit first, divided by '/'"
+            f"'{full}' is not a valid name of ROS 2: parts of letters, digits and '_', no digit first, divided by '/'"
         )
     return full
 

@@ -10,7 +10,7 @@ import typer
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.lab.embedded import EmbeddedError
-from skytether.lab.trial.rig import TrialError
+from skytether.lab.trial.errors import TrialError
 from skytether.lab.world.model import WorldError
 
 from ...output import console, fail, print_json

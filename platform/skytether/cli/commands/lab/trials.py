@@ -13,9 +13,9 @@ from rich.table import Table
 
 from skytether.api.client import ApiError, Unreachable
 from skytether.lab.embedded import EmbeddedError
+from skytether.lab.trial.errors import TrialError
 from skytether.lab.trial.report import devices
 from skytether.lab.trial.results import KeptTrials
-from skytether.lab.trial.rig import TrialError
 from skytether.lab.world.model import WorldError
 
 from ...output import console, fail

@@ -124,7 +124,7 @@ def add_robot(
         request = RobotCreate(name=name, services=tuple(service or ("*",)), group=group)
     except ValidationError as error:
         wrong = group if error.errors()[0]["loc"] == ("group",) else name
-        fail(f"'{wrong}' is no name: lower-case letters, digits and '-', at most 63", 2)
+        fail(f"'{wrong}' is not a valid name: lower-case letters, digits and '-', at most 63", 2)
     with connected(url, token_file) as client:
         made = client.create_robot(request)
     if json:
@@ -142,7 +142,7 @@ def group_robot(
 ) -> None:
     """Say with whose robots its services share what they see: with the same services of all robots of the group."""
     if group is not None and not NAME.fullmatch(group):
-        fail(f"'{group}' is no name: lower-case letters, digits and '-', at most 63", 2)
+        fail(f"'{group}' is not a valid name: lower-case letters, digits and '-', at most 63", 2)
     with connected(url, token_file) as client:
         need("robot", name, lambda: [robot.name for robot in client.robots()])
         client.set_group(name, group)

@@ -24,7 +24,7 @@ _CLAIM = "persistentVolumeClaim"
 _HOPELESS = {
     "ErrImageNeverPull": "its image '{image}' is not on the node, and is never pulled",
     "ImagePullBackOff": "its image '{image}' cannot be pulled",
-    "InvalidImageName": "'{image}' is no name of an image",
+    "InvalidImageName": "'{image}' is not a valid name of an image",
     "CreateContainerConfigError": "its container cannot be made",
     "CreateContainerError": "its container cannot be made",
     "RunContainerError": "its container cannot be run",
