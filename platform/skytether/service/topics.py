@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, overload
+from typing import Any, ClassVar, Generic, Literal, Self, TypeVar, overload
 
 from skytether.messages import ActionType, Message, ServiceType
 from skytether.wire.topic import Direction
@@ -11,9 +11,6 @@ from skytether.wire.topic import Direction
 from .calls import Caller
 from .goals import ActionServer, F, G, R
 from .mailbox import Mailbox, RawQueue, Sender
-
-if TYPE_CHECKING:
-    from .service import Service
 
 ANY = "*"
 M = TypeVar("M", bound=Message)
@@ -64,8 +61,8 @@ class Input(Typed[M]):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> Mailbox[M]: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Mailbox[M]:
+    def __get__(self, service: object, owner: type[Any]) -> Mailbox[M]: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | Mailbox[M]:
         return self  # an instance has its mailbox under the same name
 
 
@@ -87,8 +84,8 @@ class AnyInput(Declared):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> RawQueue: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | RawQueue:
+    def __get__(self, service: object, owner: type[Any]) -> RawQueue: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | RawQueue:
         return self
 
 
@@ -100,8 +97,8 @@ class Output(Typed[M]):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> Sender[M]: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Sender[M]:
+    def __get__(self, service: object, owner: type[Any]) -> Sender[M]: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | Sender[M]:
         return self
 
 
@@ -118,8 +115,8 @@ class Call(Declared, Generic[Q, A]):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> Caller[Q, A]: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Caller[Q, A]:
+    def __get__(self, service: object, owner: type[Any]) -> Caller[Q, A]: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | Caller[Q, A]:
         return self
 
 
@@ -136,8 +133,8 @@ class Action(Declared, Generic[G, R, F]):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> ActionServer[G, R, F]: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | ActionServer[G, R, F]:
+    def __get__(self, service: object, owner: type[Any]) -> ActionServer[G, R, F]: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | ActionServer[G, R, F]:
         return self
 
 
@@ -156,8 +153,8 @@ class Answer(Declared, Generic[Q, A]):
     @overload
     def __get__(self, service: None, owner: type[Any]) -> Self: ...
     @overload
-    def __get__(self, service: Service[Any], owner: type[Any]) -> Callable[[Q], A]: ...
-    def __get__(self, service: Service[Any] | None, owner: type[Any]) -> Self | Callable[[Q], A]:
+    def __get__(self, service: object, owner: type[Any]) -> Callable[[Q], A]: ...
+    def __get__(self, service: object, owner: type[Any]) -> Self | Callable[[Q], A]:
         return self
 
 
