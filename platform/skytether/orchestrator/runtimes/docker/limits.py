@@ -51,10 +51,13 @@ def parent_of(info: Mapping[str, Any]) -> dict[str, str]:
     With systemd, containers stand beside the engine. An engine that makes its groups itself puts all containers into
     one, which has no more of the processors than any one thread outside of it, whatever they have within.
     """
-    if info.get("CgroupDriver") != "cgroupfs" or info.get("Rootless"):
-        return {}
-    rootless = any("name=rootless" in option for option in info.get("SecurityOptions") or ())
-    return {} if rootless else {"CgroupParent": "/"}
+    rootless = info.get("Rootless") or "rootless" in security_of(info)
+    return {"CgroupParent": "/"} if info.get("CgroupDriver") == "cgroupfs" and not rootless else {}
+
+
+def security_of(info: Mapping[str, Any]) -> set[str]:
+    """What an engine holds its containers by, and ``rootless`` of one that is not root."""
+    return {option.partition(",")[0].removeprefix("name=") for option in info.get("SecurityOptions") or ()}
 
 
 def pull_limits(host_config: Mapping[str, Any]) -> ContainerLimits:

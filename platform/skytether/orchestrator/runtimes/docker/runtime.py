@@ -35,7 +35,7 @@ from .fence import Fence
 from .follow import Follower
 from .images import check_credentials
 from .launch import Job, kill, later_runs, remove
-from .limits import limits_of
+from .limits import limits_of, security_of
 from .logs import ContainerLog
 from .namespaces import Namespaces
 from .network import ensure_network, remove_network, remove_old_guards
@@ -185,10 +185,9 @@ class DockerRuntime(Runtime):
     @override
     def isolation(self) -> tuple[str, ...]:
         try:
-            told = self.follower.info(0).get("SecurityOptions") or ()
+            names = security_of(self.follower.info(0))
         except RuntimeFailure:
             return ()
-        names = {row.partition(",")[0].removeprefix("name=") for row in told}
         return (f"user {USER}", "no capabilities", *(word for name, word in _HOLDS.items() if name in names))
 
     def refuses(self, spec: ServiceSpec) -> str | None:
