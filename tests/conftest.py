@@ -312,19 +312,22 @@ def orchestrator_image(docker_images: Images) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def _docker_network(docker_images: Images) -> Iterator[DockerSite]:
+def _docker_network(docker_images: Images) -> Iterator[str]:
     from docker_site import DockerSite
 
     site = DockerSite(docker_images)
-    yield site
+    yield site.network
     site.close()
 
 
 @pytest.fixture
-def docker_site(_docker_network: DockerSite) -> Iterator[DockerSite]:
-    """A site on the real engine; its containers and volumes are removed after each test."""
-    yield _docker_network
-    _docker_network.clean()
+def docker_site(docker_images: Images, _docker_network: str) -> Iterator[DockerSite]:
+    """A site on the real engine, of an owner that no other test has; containers and volumes are removed at the end."""
+    from docker_site import DockerSite
+
+    site = DockerSite(docker_images, network=_docker_network)
+    yield site
+    site.clean()
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from skytether.lab.bench import conditions, traffic
 from skytether.lab.bench.bridge import BenchError, make_plan
 from skytether.lab.bench.report import cells, markdown_table
 from skytether.lab.bench.ros2_program.schedule import Order, publish
-from skytether.lab.bench.rows import Notes, Row, Run, arrival_rate, make_rows, percentiles_ms
+from skytether.lab.bench.rows import Carried, Notes, Row, Run, arrival_rate, make_rows, percentiles_ms
 from skytether.lab.bench.suites import SUITES
 from skytether.lab.bench.traffic import Flow
 from skytether.lab.bench.transports import NAMES
@@ -23,8 +23,8 @@ from skytether.wire.topic import Direction
 FLOWS = (Flow("up", 100, 10.0), Flow("down", 50, 10.0, Direction.OUT))
 
 
-def _run(wire_bytes: int | None = None) -> Run:
-    return Run("udp", "here", None, "tun", start=10.0, seconds=2.0, wire_bytes=wire_bytes, emulator_late_ms=0.1)
+def _run(carried: Carried | None = None) -> Run:
+    return Run("udp", "here", None, "tun", start=10.0, seconds=2.0, carried=carried, emulator_late_ms=0.1)
 
 
 def test_messages_of_the_window_count_once_and_in_whatever_order() -> None:
@@ -44,8 +44,10 @@ def test_messages_of_the_window_count_once_and_in_whatever_order() -> None:
 
 def test_overhead_is_what_the_link_carried_beyond_payload() -> None:
     robot, service = Notes({0: [10.0, 11.0]}, {1: []}, 0.0), Notes({1: [10.0]}, {0: []}, 0.0)
-    rows = make_rows(_run(wire_bytes=300), FLOWS, robot, service)
+    rows = make_rows(_run(Carried(10.0, 12.0, bytes=300)), FLOWS, robot, service)
     assert [row.overhead for row in rows] == [0.2, 0.2]  # 300 over 2 x 100 + 50
+    late = Carried(10.5, 12.5, bytes=130)  # counted on a busy machine: two messages were on the link by then
+    assert make_rows(_run(late), FLOWS, robot, service)[0].overhead == 0.3
     assert make_rows(_run(), FLOWS, robot, service)[0].overhead is None
 
 
@@ -57,7 +59,7 @@ def test_nothing_delivered_has_no_delays() -> None:
 
 
 def test_nothing_sent_is_not_lost() -> None:
-    row = make_rows(_run(wire_bytes=10), FLOWS[:1], Notes({0: []}, {}, 0.0), Notes({}, {0: []}, 0.0))[0]
+    row = make_rows(_run(Carried(10.0, 12.0, bytes=10)), FLOWS[:1], Notes({0: []}, {}, 0.0), Notes({}, {0: []}, 0.0))[0]
     assert (row.sent, row.lost, row.overhead) == (0, 0.0, None)
 
 

@@ -123,12 +123,12 @@ ENTRYPOINT ["/app/bin/python", "-P", "-m", "skytether.testing.toy_service"]
 
 
 class DockerSite:
-    """Docker sites of the tests: with a network of their own, and nothing left of them at the end."""
+    """Docker sites of one owner, with nothing left at the end; they have a network of their own unless one is named."""
 
-    def __init__(self, images: Images, engine: str = f"unix://{LOCAL_SOCKET}") -> None:
+    def __init__(self, images: Images, engine: str = f"unix://{LOCAL_SOCKET}", network: str = "") -> None:
         self.images = images
         self.engine = engine
-        self.network = f"skytether-test-{secrets.token_hex(4)}"
+        self.network = network or f"skytether-test-{secrets.token_hex(4)}"
         self.owner = f"test-{secrets.token_hex(4)}"
 
     def options(self, **changes: object) -> dict[str, object]:

@@ -19,7 +19,7 @@ from skytether.wire.topic import Role
 
 from .process import run_emulator, run_end
 from .ros2_program.schedule import Order
-from .rows import Row, Run, make_rows
+from .rows import Carried, Row, Run, make_rows
 from .traffic import Flow
 from .transports import EndSpec, load
 
@@ -112,8 +112,7 @@ class Pair:
         order = Order(chosen, begin, begin + warm_up, begin + warm_up + seconds)
         for end in (self._robot, self._service):
             end.send(order)
-        before, _ = self._counters_at(order.start)
-        after, late = self._counters_at(order.end)
+        carried, late = self._carried(order)
         robot, service = self._receive(self._robot), self._receive(self._service)
         run = Run(
             self._transport,
@@ -122,7 +121,7 @@ class Pair:
             self._emulator,
             order.start,
             seconds,
-            None if before is None or after is None else after - before,
+            carried,
             late,
         )
         return make_rows(run, chosen, robot, service)
@@ -139,17 +138,27 @@ class Pair:
     ) -> None:
         self.close()
 
-    def _counters_at(self, when: float) -> tuple[int | None, float | None]:
-        """Bytes of IP packets that had entered the link, both ways, and the most that one was late [ms]."""
+    def _carried(self, order: Order) -> tuple[Carried | None, float | None]:
+        """What enters the link, both ways, while the order counts, and the most that a packet was late [ms]; waits."""
+        before, _ = self._counters_at(order.start)
+        after, late = self._counters_at(order.end)
+        if before is None or after is None:
+            return None, late
+        return Carried(before[0], after[0], after[1] - before[1]), late
+
+    def _counters_at(self, when: float) -> tuple[tuple[float, int] | None, float | None]:
+        """The moment, a bit late on a busy machine, and bytes of IP packets that had entered the link, both ways.
+
+        And the most that one was late [ms].
+        """
         time.sleep(max(0.0, when - time.monotonic()))
         if self._link is None:
             return None, None
         self._link.send("counters")
-        both: list[LinkCounters] = list(self._receive(self._link).values())
-        return (
-            sum(c.bytes_received + c.received * IP_UDP_HEADERS for c in both),
-            round(max(c.late_max for c in both) * 1000, 3),
-        )
+        counted_at, counters = self._receive(self._link)
+        both: list[LinkCounters] = list(counters.values())
+        entered = sum(c.bytes_received + c.received * IP_UDP_HEADERS for c in both)
+        return (counted_at, entered), round(max(c.late_max for c in both) * 1000, 3)
 
     def _receive(self, pipe: Connection) -> Any:
         try:

@@ -78,7 +78,7 @@ class _Within:
 
 
 def run_emulator(pipe: Connection, kind: str, link: LinkConditions, options: dict[str, Any]) -> None:
-    """Be the link: report how to reach it, then answer each question with its counters until the pipe closes.
+    """Be the link: report how to reach it, then answer with the moment and its counters until the pipe closes.
 
     ``tun`` reports the paths of the robot's and the service's namespace, ``user`` its address.
     """
@@ -104,4 +104,4 @@ def run_emulator(pipe: Connection, kind: str, link: LinkConditions, options: dic
                 pipe.send(emulator.address)
             while True:
                 pipe.recv()
-                pipe.send(emulator.counters())
+                pipe.send((time.monotonic(), emulator.counters()))

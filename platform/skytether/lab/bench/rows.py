@@ -40,7 +40,8 @@ class Row:
         delay_p99_ms: Likewise.
         delay_max_ms: Likewise.
         overhead: Bytes that entered the link in both directions, IP headers included, beyond payload, over payload
-            (of all topics together: who encrypts does not show which). None where no emulator counts.
+            (of all topics together: who encrypts does not show which); less than 0 for a transport that drops messages
+            before they get there. None where no emulator counts.
         cpu_s: Processor seconds of both ends, the harness's own making of messages included.
         cpu_robot_s: The robot's share of it.
         cpu_service_s: The service's share of it.
@@ -82,6 +83,15 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
+class Carried:
+    """What entered the link, both ways: so many ``bytes`` of IP packets between two moments [s]."""
+
+    start: float
+    end: float
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """What all rows of one measurement have in common; the fields mean what they mean in `Row`."""
 
@@ -91,7 +101,7 @@ class Run:
     emulator: str
     start: float
     seconds: float
-    wire_bytes: int | None
+    carried: Carried | None
     emulator_late_ms: float | None
 
 
@@ -100,17 +110,21 @@ def make_rows(run: Run, flows: Sequence[Flow], robot: Notes, service: Notes) -> 
     end = run.start + run.seconds
     delays: list[list[float]] = []
     counts = []
-    for index in range(len(flows)):
+    payload = 0
+    for index, flow in enumerate(flows):
         sent = next((n.sent[index] for n in (robot, service) if index in n.sent), [])
         received = next((n.received[index] for n in (robot, service) if index in n.received), [])
         counts.append(sum(run.start <= t < end for t in sent))
+        if run.carried is not None:
+            payload += flow.size * sum(run.carried.start <= t < run.carried.end for t in sent)
         first: dict[int, float] = {}
         for sequence, sent_at, received_at in received:
             if run.start <= sent_at < end:
                 first.setdefault(sequence, received_at - sent_at)
         delays.append(list(first.values()))
-    payload = sum(n * flow.size for n, flow in zip(counts, flows, strict=True))
-    overhead = None if run.wire_bytes is None or not payload else run.wire_bytes / payload - 1
+    overhead = None
+    if (carried := run.carried) and payload:
+        overhead = carried.bytes / payload - 1
     rows = []
     for flow, sent_count, delay in zip(flows, counts, delays, strict=True):
         p50, p95, p99, most = percentiles_ms(delay)
