@@ -11,6 +11,12 @@ UNIT := $(BIN)/pytest -m "not slow"
 # One more than there are cores: a third of the quick tests' time is waiting.
 BY := -n $$(($$(nproc) + 1)) --dist loadfile
 SLOW := $(BIN)/pytest --durations 30 -m "slow
+TOGETHER := $(SLOW) and together and not kubernetes" $(BY) --no-loadscope-reorder
+# Most of what looks at the clock is idle most of the time.
+TIMED := $(SLOW) and not together and not kubernetes" -n 2 --dist loadfile --no-loadscope-reorder
+# Most of their time is a wait for the node, that starts pods. Files are named, for each process reads all that is given.
+CLUSTER := $(SLOW) and kubernetes" -n $$(($$(nproc) + 1)) --dist load --maxschedchunk 1 \
+	$$(grep -rl --include='*.py' 'mark\.kubernetes' tests | sed 's,/conftest.py$$,,' | sort)
 
 .PHONY: demo test slow-together slow-timed slow-kubernetes unit coverage images fuzz jepsen check terraform checkov iaas fmt docs site licences audit ros2 lock clean
 
@@ -18,23 +24,22 @@ demo: $(READY) ## run the main job: a walker asks for virtual-trail and is drive
 	$(BIN)/skytether demo
 
 test: $(READY) ## every test that this machine can run; what is missing is skipped with its reason
-	$(UNIT) $(BY)
+	@rm -f .pytest_cache/v/cache/lastfailed
+	$(UNIT) $(BY) || $(BIN)/python .ci/again.py $$?
 	@export SKYTETHER_TEST_IMAGES=skytether-test-$$$$/; trap '.ci/remove-images "$$SKYTETHER_TEST_IMAGES"' EXIT; trap 'exit 130' INT TERM; \
-		failed=0; echo "Slow tests that bear company ..."; $(MAKE) --no-print-directory slow-together || failed=1; \
-		echo "Slow tests that look at the clock, two at a time ..."; $(MAKE) --no-print-directory slow-timed || failed=1; \
-		echo "A cluster, for the tests that need one ..."; $(MAKE) --no-print-directory slow-kubernetes || failed=1; exit $$failed
+		failed=; echo "Slow tests that bear company ..."; $(TOGETHER) || failed="$$failed $$?"; \
+		echo "Slow tests that look at the clock, two at a time ..."; $(TIMED) || failed="$$failed $$?"; \
+		echo "A cluster, for the tests that need one ..."; $(CLUSTER) || failed="$$failed $$?"; \
+		$(BIN)/python .ci/again.py $$failed
 
 slow-together: $(READY)
-	$(SLOW) and together and not kubernetes" $(BY) --no-loadscope-reorder
+	$(TOGETHER)
 
-# Most of what looks at the clock is idle most of the time.
 slow-timed: $(READY)
-	$(SLOW) and not together and not kubernetes" -n 2 --dist loadfile --no-loadscope-reorder
+	$(TIMED)
 
-# Most of their time is a wait for the node, that starts pods. Files are named, for each process reads all that is given.
 slow-kubernetes: $(READY)
-	$(SLOW) and kubernetes" -n $$(($$(nproc) + 1)) --dist load --maxschedchunk 1 \
-		$$(grep -rl --include='*.py' 'mark\.kubernetes' tests | sed 's,/conftest.py$$,,' | sort)
+	$(CLUSTER)
 
 unit: $(READY) ## the quick part, under a minute
 	$(UNIT) $(BY)
