@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 from skytether.cli.commands.lab.app import app
 from skytether.lab.bench import face as bench
-from skytether_services.follow_in_front.bench_face import look
+from skytether_services.follow_in_front.bench_face import track_faces
 
 
 @pytest.mark.slow
 def test_a_head_that_turns_is_seen_to_turn(gl: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "load", lambda _name, _extra: look)
+    monkeypatch.setattr(bench, "load", lambda _name, _extra: track_faces)
     found = bench.bench_face((0.9,), math.radians(9), [1])
     assert found["pictures"] == 40
     assert found["detected_percent"] == 100
@@ -27,7 +27,7 @@ def test_a_head_that_turns_is_seen_to_turn(gl: None, monkeypatch: pytest.MonkeyP
 
 
 def test_without_a_face_there_is_no_error_to_tell() -> None:
-    nothing = bench.row_of([math.nan], [look([_grey()], 1.0)[0]])
+    nothing = bench.row_of([math.nan], [track_faces([_grey()], 1.0)[0]])
     assert nothing["detected_percent"] == 0
     assert nothing["yaw_error_mean_deg"] is None
 

@@ -74,21 +74,21 @@ def test_a_disk_that_is_not_seen_is_told_of() -> None:
 
 
 def test_an_engine_that_is_missing_or_is_none_is_told(tmp_path: Path) -> None:
-    missing, found = checks.look_at_engine(str(tmp_path / "none.sock"))
+    missing, found = checks.check_engine(str(tmp_path / "none.sock"))
     assert found is None
     assert missing.says.startswith(f"there is no Docker engine at {tmp_path}/none.sock: install one")
     path = Path(os.path.relpath(tmp_path / "e.sock"))  # a short one
     with socket.socket(socket.AF_UNIX) as nobody:
         nobody.bind(str(path))
-    refused, _ = checks.look_at_engine(str(path))
+    refused, _ = checks.check_engine(str(path))
     assert "does not answer (Connection refused): `systemctl status docker` says more" in refused.says
     engine = MadeUpEngine(path)
     try:
-        good, found = checks.look_at_engine(str(path))
+        good, found = checks.check_engine(str(path))
         assert good.good
         assert found == ask_engine(str(path))
         del engine.info["NCPU"]
-        strange, _ = checks.look_at_engine(str(path))
+        strange, _ = checks.check_engine(str(path))
         assert "is no Docker engine: its answer has no 'NCPU'" in strange.says
     finally:
         engine.stop()
@@ -98,18 +98,18 @@ def test_a_port_that_is_taken_is_named_with_what_shows_by_whom() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("0.0.0.0", 0))
         port = other.getsockname()[1]
-        taken = checks.look_at_ports((port,), None)
+        taken = checks.check_ports((port,), None)
         assert taken.says.startswith(
             f"UDP port {port} is taken by another program: `ss -lunp 'sport = :{port}'` names it"
         )
-        assert "--echo-port" in checks.look_at_ports((), port).says
-    assert checks.look_at_ports((port,), None).good
+        assert "--echo-port" in checks.check_ports((), port).says
+    assert checks.check_ports((port,), None).good
 
 
 def test_a_unit_wants_root_and_a_folder_that_may_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    assert checks.look_at_rights(tmp_path / "a" / "b", unit=False).good
+    assert checks.check_rights(tmp_path / "a" / "b", unit=False).good
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert "needs root: run this with sudo, or give --no-unit" in checks.look_at_rights(tmp_path, unit=True).says
+    assert "needs root: run this with sudo, or give --no-unit" in checks.check_rights(tmp_path, unit=True).says
 
 
 @pytest.mark.parametrize(
@@ -167,14 +167,14 @@ def test_a_folder_into_which_others_may_put_another_authority_is_refused(tmp_pat
     open_to_all = tmp_path / "open"
     open_to_all.mkdir()
     open_to_all.chmod(0o777)
-    found = checks.look_at_rights(open_to_all / "node", unit=False)
+    found = checks.check_rights(open_to_all / "node", unit=False)
     assert not found.good
     assert f"others may write to {open_to_all}" in found.says
     (open_to_all / "node").mkdir(mode=0o700)
     with pytest.raises(NodeError, match="is not trusted: others may replace"):
         NodeStore(open_to_all / "node").config()
     open_to_all.chmod(0o755)
-    assert checks.look_at_rights(open_to_all / "other", unit=False).good
+    assert checks.check_rights(open_to_all / "other", unit=False).good
     with pytest.raises(NodeError, match="this machine has not joined"):
         NodeStore(open_to_all / "node").config()
 
@@ -186,4 +186,4 @@ def test_a_folder_that_somebody_made_where_all_may_is_not_the_nodes() -> None:
         theirs = Path(place) / "node"
         theirs.mkdir()
         os.chown(theirs, 65_534, 65_534)
-        assert "belongs to the user 65534" in checks.look_at_rights(theirs, unit=False).says
+        assert "belongs to the user 65534" in checks.check_rights(theirs, unit=False).says

@@ -151,7 +151,7 @@ class Relay:
     def stats(self) -> RelayStats:
         """A snapshot; after `stop` the last one."""
         try:
-            return self._call(self._take_stats)
+            return self._call(self._collect_stats)
         except BridgeError:
             return self._last_stats
 
@@ -191,7 +191,7 @@ class Relay:
         try:
             self._loop.run_forever()
             self._loop.run_until_complete(asyncio.sleep(0))  # who waits for an answer gets it
-            self._last_stats = self._take_stats()
+            self._last_stats = self._collect_stats()
         finally:
             for route in self._table.routes:
                 self._table.remove(route.prefix)
@@ -253,7 +253,7 @@ class Relay:
         if port.send(data, address, segment) < len(data):
             self._table.rejected["socket_full"] += 1
 
-    def _take_stats(self) -> RelayStats:
+    def _collect_stats(self) -> RelayStats:
         table = self._table
         newcomers = [route.flow for route in table.routes]
         errors = self._errors + self._socket.errors

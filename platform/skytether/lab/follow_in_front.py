@@ -124,7 +124,7 @@ class FollowTrial:
         pictures = _Pictures(lambda topic, message: self.rig.graph.publish(topic, message))
         self.camera = Camera(self.world, pictures.publish)
         task = Task(SERVICE, settings.scenario.params, ROBOT, LIMITS, NAMES)
-        observers = (self.camera.observe, self._hear_sonars)
+        observers = (self.camera.observe, self._note_sonars)
         self.rig = Rig(settings, task, self.world, observers=observers, simulating=pictures.drawing_s)
         self._operator_way: list[Point] = []
         self._looks = self._following = 0
@@ -174,7 +174,7 @@ class FollowTrial:
                 on_progress(self.round, self.rig.status)
             return self._result(drive.measured(), drive)
 
-    def _hear_sonars(self, world: Simulation, found: Sequence[Readings]) -> None:
+    def _note_sonars(self, world: Simulation, found: Sequence[Readings]) -> None:
         cloud = sonar_cloud(found[0], world.params)
         if cloud is not None:
             self.rig.graph.publish(SONAR, cloud)

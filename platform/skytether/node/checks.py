@@ -36,7 +36,7 @@ class Finding:
     """It is told, and joining goes on."""
 
 
-def look_at_engine(path: str) -> tuple[Finding, EngineInfo | None]:
+def check_engine(path: str) -> tuple[Finding, EngineInfo | None]:
     """Is there an engine that is new enough, and is it one of this machine?"""
     if not Path(path).exists():
         text = (
@@ -130,7 +130,7 @@ def judge_address(address: str, *, named: bool, orchestrator: str) -> Finding:
     return Finding("address", f"robots are told {address}")
 
 
-def look_at_ports(ports: Iterable[int], echo: int | None, why: str = "") -> Finding:
+def check_ports(ports: Iterable[int], echo: int | None, why: str = "") -> Finding:
     """Are the UDP ports free that instances and the echo are to have?"""
     wanted = [*ports]
     taken = [port for port in {*wanted, *([echo] if echo else [])} if not _is_free(port)]
@@ -146,7 +146,7 @@ def look_at_ports(ports: Iterable[int], echo: int | None, why: str = "") -> Find
     return Finding("ports", f"{told}{f', echo on {echo}' if echo else ''}: free{why}")
 
 
-def look_at_rights(folder: Path, *, unit: bool) -> Finding:
+def check_rights(folder: Path, *, unit: bool) -> Finding:
     """May this be written, and is there a systemd to run it?"""
     if unit and os.geteuid() != 0:
         text = "writing a unit of systemd needs root: run this with sudo, or give --no-unit and run the node yourself"
@@ -165,7 +165,7 @@ def look_at_rights(folder: Path, *, unit: bool) -> Finding:
     return Finding("rights", f"keys go to {folder}")
 
 
-def look_at_disk(engine: EngineInfo) -> Finding:
+def check_disk(engine: EngineInfo) -> Finding:
     """Is there room where the engine keeps its images?"""
     return judge_disk(free_mb(engine.folder), engine.folder or "/")
 

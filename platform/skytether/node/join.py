@@ -151,7 +151,7 @@ def join(options: JoinOptions, on_finding: Callable[[Finding], object] = lambda 
         with steps.step("site"), contextlib.nullcontext() if options.unit else _linked(store):
             stands = _until_there(store, url, by_unit=options.unit)
     except BaseException as error:
-        _take_back(store, url)
+        _withdraw(store, url)
         if isinstance(error, OSError):
             raise NodeError(
                 f"cannot write to {options.folder}: {error.strerror}; nothing is left of the join"
@@ -190,14 +190,14 @@ def _check(
         found.append(finding)
         on_finding(finding)
 
-    note(checks.look_at_rights(options.folder, unit=options.unit))
-    finding, engine = checks.look_at_engine(path)
+    note(checks.check_rights(options.folder, unit=options.unit))
+    finding, engine = checks.check_engine(path)
     note(finding)
     if engine is not None:
         note(checks.judge_memory(engine.memory_mb))
-        note(checks.look_at_disk(engine))
+        note(checks.check_disk(engine))
     ports = range(options.ports[0], options.ports[1] + 1) if options.ports else ()
-    note(checks.look_at_ports(ports, options.echo))
+    note(checks.check_ports(ports, options.echo))
     answered, seen = _reach(options.urls, pin, note)
     if seen is not None:
         note(checks.judge_clock(seen.ahead_s))
@@ -293,7 +293,7 @@ def _linked(store: NodeStore) -> Iterator[None]:
         thread.join()
 
 
-def _take_back(store: NodeStore, url: str) -> None:
+def _withdraw(store: NodeStore, url: str) -> None:
     with contextlib.suppress(NodeError):
         call(url, trusting(store.authority(), store.identity), Leave(force=True), Stands)
     unit.remove()

@@ -275,7 +275,7 @@ class Orchestrator:
         self.shared_topics.sync()
 
     def _elect(self) -> float:
-        if self.look_outdated():
+        if self.check_outdated():
             self.leadership.end()
             return _SECOND
         delay = self.leadership.step()
@@ -291,7 +291,7 @@ class Orchestrator:
             try:
                 return _SECOND if self.outdated else step(*args, **kwargs)
             except ProgrammingError:
-                if not self.look_outdated():
+                if not self.check_outdated():
                     raise
                 return _SECOND
 
@@ -308,7 +308,7 @@ class Orchestrator:
         since, grace = self._outdated_since, self.settings.timing.outdated_grace
         return since is not None and time.monotonic() - since >= grace
 
-    def look_outdated(self) -> bool:
+    def check_outdated(self) -> bool:
         """Whether a newer orchestrator has changed the database's schema; the last answer while that is away."""
         try:
             outdated = self.store.outdated()
@@ -360,7 +360,7 @@ class Orchestrator:
         try:
             self.store.ping()
         except Exception as error:  # whatever the database's driver raises
-            self._tell_why(f"the database does not answer: {error}")
+            self._log_once(f"the database does not answer: {error}")
             return "the database does not answer"  # anybody may ask: what a driver says is for the log
         if self.outdated:
             return str(OutdatedError())
@@ -369,7 +369,7 @@ class Orchestrator:
             return f"the reconciler has made no pass for {silent:.0f} s"
         return ""
 
-    def _tell_why(self, why: str) -> None:
+    def _log_once(self, why: str) -> None:
         """Once, however often it is asked."""
         if why != self._told_why:
             self._told_why = why

@@ -198,13 +198,13 @@ class RuntimeContract:
             runtime.start(kit.launch(instance))
         for instance in ("i1", "i2"):
             kit.until(runtime, Phase.RUNNING, instance)
-        seen = runtime.look_at({"i2", "nobody"})
+        seen = runtime.observe_some({"i2", "nobody"})
         assert list(seen) == ["i2"]
         assert (seen["i2"].phase, seen["i2"].port) == (Phase.RUNNING, runtime.observe()["i2"].port)
-        assert runtime.look_at(()) == {}
+        assert runtime.observe_some(()) == {}
         runtime.stop("i2", force=True)
         deadline = time.monotonic() + kit.patience
-        while runtime.look_at(["i2"])["i2"].phase is not Phase.EXITED:
+        while runtime.observe_some(["i2"])["i2"].phase is not Phase.EXITED:
             assert time.monotonic() < deadline
             time.sleep(0.005)
 

@@ -32,7 +32,7 @@ class Seen(NamedTuple):
     wall_ms: float
 
 
-def look(pictures: Iterable[bytes], field_of_view: float) -> list[Seen]:
+def track_faces(pictures: Iterable[bytes], field_of_view: float) -> list[Seen]:
     """Follow the faces of one camera.
 
     Args:

@@ -422,7 +422,7 @@ class MadeUpSystemd:
         self.texts: list[str] = []
         self.trouble = ""
         self._nodes = nodes
-        monkeypatch.setattr(checks, "look_at_rights", lambda *_, **__: checks.Finding("rights", "made up"))
+        monkeypatch.setattr(checks, "check_rights", lambda *_, **__: checks.Finding("rights", "made up"))
         monkeypatch.setattr(unit, "install", self.install)
         monkeypatch.setattr(unit, "remove", self.stack.close)
         monkeypatch.setattr(unit, "trouble", lambda: self.trouble)

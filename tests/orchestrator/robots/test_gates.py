@@ -123,7 +123,7 @@ def test_what_cannot_be_written_is_kept_and_what_came_meanwhile_is_newer(
         raise OperationalError("", None, Exception("the database is away"))
 
     with monkeypatch.context() as patch:
-        patch.setattr(store, "hear_gates", away)
+        patch.setattr(store, "save_gates", away)
         with pytest.raises(OperationalError):
             gates.write()
     gates.write()

@@ -170,7 +170,7 @@ def test_what_cannot_be_written_is_kept_for_the_next_time(
 
     robots.ask("a", "a crate")
     with monkeypatch.context() as patch:
-        patch.setattr(store, "hear_shared", away)
+        patch.setattr(store, "save_shared", away)
         with pytest.raises(OperationalError):
             robots.shared_topics.sync()
     assert robots.heard("b") == {"a": ("a crate", 0.0)}

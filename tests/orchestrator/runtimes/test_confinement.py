@@ -378,21 +378,21 @@ def test_a_user_is_one_instances_of_all_sites_and_nobody_elses(monkeypatch: pyte
     monkeypatch.setattr(users, "_taken", {})
     monkeypatch.setattr(users, "USERS", (61_184, 61_186))
     monkeypatch.setattr(users, "users_of_processes", lambda: {0, 61_185})
-    first = users.take_user("lab/i1", None)
-    second = users.take_user("edge/i1", None)
+    first = users.allocate_user("lab/i1", None)
+    second = users.allocate_user("edge/i1", None)
     assert {first, second} == {61_184, 61_186}
-    assert users.take_user("lab/i1", None) == first
+    assert users.allocate_user("lab/i1", None) == first
     with pytest.raises(RuntimeFailure, match="all users from 61184 to 61186 are taken"):
-        users.take_user("lab/i2", 61_185)
+        users.allocate_user("lab/i2", 61_185)
     assert users.keep_user("lab/i3", second) is None
-    users.give_user_back("edge/i1")
-    assert users.take_user("lab/i2", second) == second
+    users.free_user("edge/i1")
+    assert users.allocate_user("lab/i2", second) == second
     monkeypatch.setattr(users, "_taken", {})
     assert users.keep_user("lab/i3", 61_185) == 61_185  # its own run
     monkeypatch.setattr(users, "USERS", (0, 0))
     monkeypatch.setattr(users, "users_of_processes", set)
     with pytest.raises(RuntimeFailure):  # root has a name
-        users.take_user("lab/i4", None)
+        users.allocate_user("lab/i4", None)
 
 
 @pytest.mark.slow
@@ -407,7 +407,7 @@ def test_the_end_of_one_sites_instance_is_none_of_anothers(tmp_path: Path, monke
         until(runtime, Phase.RUNNING)
     again = ProcessRuntime("lab", tmp_path / "lab", ProcessOptions())  # as after a restart
     again.remove("i1")
-    assert edge.look_at(["i1"])["i1"].phase is Phase.RUNNING
+    assert edge.observe_some(["i1"])["i1"].phase is Phase.RUNNING
     edge.remove("i1")
     lab.remove("i1")
 

@@ -301,7 +301,7 @@ def test_a_run_whose_note_was_broken_is_ended_before_the_next_begins(
     pid = pid_of(tmp_path)
     for second in (runtime, open_runtime()):  # the leader that began it, and the next one
         _broken(tmp_path / "instances/i1/run.json", content)
-        assert second.look_at(["i1"])["i1"].phase is Phase.RUNNING
+        assert second.observe_some(["i1"])["i1"].phase is Phase.RUNNING
     second.start(launch(attempt=2))
     assert not alive(pid)
     assert until(second, Phase.RUNNING).attempt == 2

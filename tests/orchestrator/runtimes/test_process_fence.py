@@ -108,7 +108,7 @@ def test_a_leader_that_is_frozen_in_the_middle_of_a_start(
         leader.lead(2)
         leader.start(launch("i3"))
         until(lambda: leader.observe()["i3"].phase is Phase.RUNNING)  # only that one instance is held up
-        assert leader.look_at(["i1"])["i1"].phase is Phase.STARTING
+        assert leader.observe_some(["i1"])["i1"].phase is Phase.STARTING
         for act in (
             lambda: leader.start(launch()),
             lambda: leader.stop("i1", force=True),

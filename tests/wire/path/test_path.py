@@ -88,7 +88,7 @@ def test_more_parity_is_planned_once_the_peer_tells_of_losses(path):
     before = path.redundancy.parity(40, 1, 0.99)
     for turn in range(1, 30):
         lossy = NOTHING._replace(settled=1000 * turn, lost=200 * turn, runs=150 * turn, time=0.1 * turn)
-        path.take_feedback(lossy._replace(time_squared=0.001 * turn), 10.0 + 0.1 * turn)
+        path.apply_feedback(lossy._replace(time_squared=0.001 * turn), 10.0 + 0.1 * turn)
     assert path.redundancy.parity(40, 1, 0.99) > before
     assert path.loss_out.model.loss == pytest.approx(0.2, abs=0.05)
 
@@ -96,13 +96,13 @@ def test_more_parity_is_planned_once_the_peer_tells_of_losses(path):
 def test_until_a_burst_was_answered_for_a_path_is_sent_on_with_caution(path):
     assert path.pacer.rate * 8 == max(UNKNOWN[0], CONFIG.rate_bps * UNKNOWN[1]) < CONFIG.rate_bps
     for turn in range(1, 10):
-        path.take_feedback(NOTHING, 10.0 + 0.1 * turn)
+        path.apply_feedback(NOTHING, 10.0 + 0.1 * turn)
     assert path.pacer.rate * 8 <= CONFIG.rate_bps * UNKNOWN[1], "nothing was sent that could be answered for"
     path.rtts.add(0.02)
     path.pacer.budget(11.0)
     path.pacer.spend(BURST)
     for turn in range(1, 10):
-        path.take_feedback(NOTHING, 11.0 + 0.1 * turn)
+        path.apply_feedback(NOTHING, 11.0 + 0.1 * turn)
     assert path.pacer.rate * 8 == path.control.rate > 2 * CONFIG.rate_bps * UNKNOWN[1]
 
 

@@ -355,7 +355,7 @@ class Scaler:
 
     def _report(self, group: SiteGroup, text: str, level: int = logging.INFO) -> None:
         log.log(level, "group %s: %s", group.name, text)
-        self._store.tell_site_group(group.name, self._clock(), text)
+        self._store.note_site_group_event(group.name, self._clock(), text)
 
 
 def _standing(group: SiteGroup, row: GroupRow, machines: Sequence[MachineRow]) -> str:

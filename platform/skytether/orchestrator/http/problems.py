@@ -141,7 +141,7 @@ async def answer_to(request: Request, error: Exception) -> JSONResponse:
         return answer(request, 503, "Not possible now", text, headers={"Retry-After": _RETRY_AFTER})
     if isinstance(error, ProgrammingError):
         core: Orchestrator = request.app.state.core
-        if await asyncio.to_thread(core.look_outdated):
+        if await asyncio.to_thread(core.check_outdated):
             return _on_domain(request, OutdatedError())
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
     return answer(request, 500, "Internal error", "a mistake in the orchestrator: its log has the details")

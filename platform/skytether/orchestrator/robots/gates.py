@@ -57,7 +57,7 @@ class Gates:
                 heard, self._heard = self._heard, {}
             try:
                 if heard:
-                    self._store.hear_gates(heard.values())
+                    self._store.save_gates(heard.values())
                 heard = {}
             finally:
                 with self._taking:

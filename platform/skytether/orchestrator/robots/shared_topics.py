@@ -108,7 +108,7 @@ class SharedTopics:
                 keys, self._unwritten = self._unwritten, set()
                 said = [self._words[key] for key in keys]
             try:
-                self._store.hear_shared(said, self._clock() - KEPT_S)
+                self._store.save_shared(said, self._clock() - KEPT_S)
             except BaseException:
                 with self._lock:
                     self._unwritten |= keys

@@ -270,7 +270,7 @@ class Runtime(ABC):
         For runtimes that spend something on each, and are told what is there by a machine of somebody else's.
         """
 
-    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+    def observe_some(self, instances: Collection[str]) -> Mapping[str, Observation]:
         """What ``observe`` tells, of these only: asked again and again while they start or stop, so it should be cheap.
 
         Raises:

@@ -54,7 +54,7 @@ from .hosts import AdvertisedHost, BindHost, check_advertised
 from .notes import noted_port, read_json, write_private
 from .procfs import BOOT_ID, ProcessId, ProcessStat, all_children_run, stat_of
 from .runs import OWN, Run, Runs
-from .users import give_user_back, hand_over, noted_user, take_user
+from .users import allocate_user, free_user, hand_over, noted_user
 
 log = logging.getLogger(__name__)
 
@@ -220,7 +220,7 @@ class ProcessRuntime(Runtime):
             write_private(folder / "run.json", json.dumps({**note, "process": [process.pid, process.start_time]}))
         except OSError as error:
             if anew:
-                give_user_back(str(folder))
+                free_user(str(folder))
             raise RuntimeFailure(f"cannot start {launch.grant.service} on this machine: {error}") from error
         run = Run(launch.attempt, process, str(folder), str(data), ready, user, child)
         self._runs.keep(launch.instance, run)
@@ -235,7 +235,7 @@ class ProcessRuntime(Runtime):
         """An instance's own, the same in all its runs, so that it can go on with its data; None: there are none."""
         if not (self._machine and self._machine.user):
             return None
-        return take_user(str(folder), noted_user(noted.get("user")))
+        return allocate_user(str(folder), noted_user(noted.get("user")))
 
     def _prepare(self, launch: Launch, folder: Path, data: Path, port: int | None, user: int | None) -> str:
         """Make the run's own folder, with the grant in it; returns the path of the ready file."""
@@ -302,7 +302,7 @@ class ProcessRuntime(Runtime):
         return {i: seen for i, run in runs.items() if (seen := self._seen(run, measure=measure, all_run=all_run))}
 
     @override
-    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+    def observe_some(self, instances: Collection[str]) -> Mapping[str, Observation]:
         runs = ((instance, self._runs.find(instance)) for instance in instances)
         return {i: seen for i, run in runs if run and (seen := self._seen(run))}
 

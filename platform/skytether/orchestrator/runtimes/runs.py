@@ -26,7 +26,7 @@ from .disk import remove_tree, size_of
 from .fence import Fence
 from .notes import noted_port, read_json, write_private
 from .procfs import BOOT_ID, ProcessId, find_by_environment, session_members, stat_of, user_of
-from .users import end_all_of, give_user_back, keep_user, noted_user
+from .users import end_all_of, free_user, keep_user, noted_user
 
 OWN = "own"
 """A run's own folder, in that of its instance."""
@@ -250,7 +250,7 @@ class Runs:
         run = self._known.pop(instance, None)
         if run is not None and run.child is not None:
             self._let_go_of(run.child)
-        give_user_back(f"{self._folder}/{instance}")
+        free_user(f"{self._folder}/{instance}")
 
     def _let_go_of(self, child: subprocess.Popen[bytes]) -> None:
         if child.poll() is None:

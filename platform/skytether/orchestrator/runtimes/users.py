@@ -33,7 +33,7 @@ def noted_user(noted: object) -> int | None:
     return noted if type(noted) is int and USERS[0] <= noted <= USERS[1] else None
 
 
-def take_user(instance: str, noted: int | None) -> int:
+def allocate_user(instance: str, noted: int | None) -> int:
     """An instance's own, until it is given back: the same again, that of its runs before, or one that nobody is.
 
     Raises:
@@ -60,7 +60,7 @@ def keep_user(instance: str, noted: int | None) -> int | None:
         return noted
 
 
-def give_user_back(instance: str) -> None:
+def free_user(instance: str) -> None:
     """Nothing of the instance is left."""
     with _lock:
         _taken.pop(instance, None)

@@ -48,7 +48,7 @@ class Promises:
         if record.site is None:
             return
         with self._lock:
-            self._take_back(self._sums, self._of.pop(record.id, None))
+            self._subtract(self._sums, self._of.pop(record.id, None))
             given = record.site, _needs(record)
             self._of[record.id] = given
             self._sums[record.site] = _sum(self._sums.get(record.site, NOTHING), given[1], 1)
@@ -56,18 +56,18 @@ class Promises:
     def remove(self, record: Record) -> None:
         """It has none any more."""
         with self._lock:
-            self._take_back(self._sums, self._of.pop(record.id, None))
+            self._subtract(self._sums, self._of.pop(record.id, None))
 
     def sums(self, without: Iterable[str] = ()) -> Sums:
         """As they are now, or as they would be without some instances."""
         with self._lock:
             sums = dict(self._sums)
             for instance in without:
-                self._take_back(sums, self._of.get(instance))
+                self._subtract(sums, self._of.get(instance))
         return sums
 
     @staticmethod
-    def _take_back(sums: dict[str, Promised], given: tuple[str, Promised] | None) -> None:
+    def _subtract(sums: dict[str, Promised], given: tuple[str, Promised] | None) -> None:
         if given is not None:
             site, needs = given
             sums[site] = _sum(sums[site], needs, -1)

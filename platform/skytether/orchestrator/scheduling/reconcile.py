@@ -211,7 +211,7 @@ class Reconciler:
                 site.capacity = believable(site.runtime.capacity())  # nodes come and go
             if whole:
                 site.runtime.expect(len(ids))
-            looked = site.runtime.observe() if whole else site.runtime.look_at(ids)
+            looked = site.runtime.observe() if whole else site.runtime.observe_some(ids)
             if due:
                 site.load = site.runtime.load()
         except RuntimeFailure as error:
@@ -414,7 +414,7 @@ def _as_it_was(site: Site) -> bool:
     if site.awaited is None:
         return False
     try:
-        seen = site.runtime.look_at(site.awaited) if site.awaited else {}
+        seen = site.runtime.observe_some(site.awaited) if site.awaited else {}
     except RuntimeFailure:
         return False  # the pass says so
     return all(_same(seen.get(instance), site.observed.get(instance)) for instance in site.awaited)

@@ -196,7 +196,7 @@ class Resizing:
         if _is_more(size, has):
             left = bounded(size, has, self._left(record.robot))
             if not _is_more(left, has):
-                self._tell_once(record, f"would get {size}, for {proposed.why}: its robot may have no more", known, now)
+                self._log_once(record, f"would get {size}, for {proposed.why}: its robot may have no more", known, now)
                 return
             size = left if keeps else bounded(left, has, self._placer.room(site))
             if keeps or not _is_more(size, has):
@@ -219,9 +219,9 @@ class Resizing:
         moved, text = self._successors.move_for_size(record, size, why)
         if moved is None:
             self._metrics.not_resized(record)
-        self._tell_once(record, text, known, now)
+        self._log_once(record, text, known, now)
 
-    def _tell_once(self, record: Record, text: str, known: _Known, now: float) -> None:
+    def _log_once(self, record: Record, text: str, known: _Known, now: float) -> None:
         without_numbers = "".join(c for c in text if not c.isdigit())
         if without_numbers not in known.told and self._store.change(noted(record, text), now) is not None:
             known.told.add(without_numbers)

@@ -15,7 +15,7 @@ from skytether.api.rest import GateReport, Scope, SiteCreate
 
 from ..domain.security import TokenHash
 from .engine import ADMITTING, SQLITE_PATIENCE, make_engine, migrate, reading
-from .leader import LEAD_PATIENCE_S, Lock, lock_of, look_at_fence
+from .leader import LEAD_PATIENCE_S, Lock, check_fence, lock_of
 from .models import facts, gates, orchestrators, robots, services, shared, sites, stops, tokens
 from .node_rows import NodeRows
 
@@ -143,7 +143,7 @@ class Database:
         turn = self._engine.dialect.name == "sqlite" and self._turn.acquire(timeout=SQLITE_PATIENCE)
         try:
             with self._reader.connect() if alone else self._writer.begin() as connection:
-                look_at_fence(connection)
+                check_fence(connection)
                 yield connection
         finally:
             if turn:
@@ -329,7 +329,7 @@ class Database:
         with self._reader.connect() as connection:
             return [SharedRow(*row) for row in connection.execute(select(shared)).all()]
 
-    def hear_shared(self, heard: Iterable[SharedRow], before: float) -> None:
+    def save_shared(self, heard: Iterable[SharedRow], before: float) -> None:
         """Instead of what they told before, in order, as gates; what was told before a time is forgotten."""
         ordered = sorted(heard, key=lambda row: (row.robot, row.service))
         rows = [
@@ -379,7 +379,7 @@ class Database:
             rows = connection.execute(select(gates)).all()
         return {row.robot: GateRow(row.robot, row.at, GateReport.model_validate(row.report)) for row in rows}
 
-    def hear_gates(self, heard: Iterable[GateRow]) -> None:
+    def save_gates(self, heard: Iterable[GateRow]) -> None:
         """Instead of what they said before; in order, lest two orchestrators wait for each other."""
         ordered = sorted(heard, key=lambda row: row.robot)
         rows = [

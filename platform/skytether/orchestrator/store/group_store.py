@@ -89,7 +89,7 @@ class GroupStore(Database):
         with self._writing() as connection:
             connection.execute(update(site_groups).where(site_groups.c.name == name).values(**values))
 
-    def tell_site_group(self, name: str, now: float, text: str) -> None:
+    def note_site_group_event(self, name: str, now: float, text: str) -> None:
         """Keep what was done, beside the last ones."""
         mine = site_groups.c.name == name
         with self._writing() as connection:

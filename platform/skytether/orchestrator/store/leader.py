@@ -87,7 +87,7 @@ def fence() -> int:
     return _epoch.get()
 
 
-def look_at_fence(connection: Connection) -> None:
+def check_fence(connection: Connection) -> None:
     """To be called in each transaction that changes something.
 
     No lock is taken that a frozen leader would hold: a change that is under way when another one takes the lead is one

@@ -221,7 +221,7 @@ class Paths:
         first = path.echo is None
         if path.echo is None or sent_at > path.echo[0]:
             path.echo = sent_at, now
-            path.take_feedback(ping.feedback, now)
+            path.apply_feedback(ping.feedback, now)
         path.losses.leave_out(ping.astray)
         if ping.ask:
             echo = round(sent_at * 1e6)

@@ -146,7 +146,7 @@ class Path:
         self.loss_in.update(sums, now)
         return Feedback(delays.capacity, delays.queue, delays.rate, losses.settled, losses.lost, losses.runs, *sums[3:])
 
-    def take_feedback(self, feedback: Feedback, now: float) -> None:
+    def apply_feedback(self, feedback: Feedback, now: float) -> None:
         """Follow what the peer knows."""
         new = self.loss_out.update(Sums(*feedback[3:]), now)
         self.redundancy.model = self.loss_out.model.rounded()

@@ -31,7 +31,7 @@ def check_run(settings: RobotConfig, folder: Path, token: str, role: str = "chec
     Raises:
         ConfigError: The graph cannot be joined.
     """
-    manifest, findings = look_at_orchestrator(settings, token)
+    manifest, findings = check_orchestrator(settings, token)
     findings += settings.kind.check(
         settings.graph,
         settings.graph_config,
@@ -40,7 +40,7 @@ def check_run(settings: RobotConfig, folder: Path, token: str, role: str = "chec
         command_topic=settings.command_topic,
         role=role,
     )
-    return [*findings, *plausible(settings), look_at_gate(settings), *look_at_record(settings)]
+    return [*findings, *plausible(settings), check_gate(settings), *check_record(settings)]
 
 
 def plausible(settings: RobotConfig) -> list[Finding]:
@@ -68,7 +68,7 @@ def show(findings: Sequence[Finding]) -> bool:
     return not wrong
 
 
-def look_at_orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
+def check_orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | None, list[Finding]]:
     """Whether it has the service, and what that takes and gives."""
     try:
         with Client(
@@ -84,7 +84,7 @@ def look_at_orchestrator(settings: RobotConfig, token: str) -> tuple[Manifest | 
     return manifest, [Finding("orchestrator", settings.orchestrator, "", says)]
 
 
-def look_at_gate(settings: RobotConfig) -> Finding:
+def check_gate(settings: RobotConfig) -> Finding:
     """Whether there is a gate before the wheels, or will be, and whether it is stopped."""
     safety = settings.safety
     if safety is None:
@@ -101,7 +101,7 @@ def look_at_gate(settings: RobotConfig) -> Finding:
     return Finding("gate", where, "", f"{says}{assumed}", good=not stopped)
 
 
-def look_at_record(settings: RobotConfig) -> list[Finding]:
+def check_record(settings: RobotConfig) -> list[Finding]:
     """Whether what stopped the robot will be known after a reboot; a warning, for the gate does its work without."""
     safety = settings.safety
     lost = "" if safety is None else lost_at_reboot(str(safety.record_file()))

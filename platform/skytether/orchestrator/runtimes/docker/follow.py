@@ -297,7 +297,7 @@ class Follower:
         for container in there if anew else self._changed(rows, there):
             seen = self.inspect(container)
             if anew and seen is not None and seen.runs and not seen.ready:
-                self._look_ready(container)  # or an adopted one would seem to start
+                self._check_ready(container)  # or an adopted one would seem to start
 
     def _changed(self, rows: Sequence[Mapping[str, Any]], there: Sequence[str]) -> list[str]:
         """Those of a list that are not as they were seen last: events say the rest."""
@@ -323,26 +323,26 @@ class Follower:
                 elif action in _TOLD:
                     self.inspect(container)
                 elif action.startswith(_AT_WILL):
-                    self._look_now_and_then(container)
+                    self._inspect_now_and_then(container)
 
-    def _look_now_and_then(self, container: str) -> None:
+    def _inspect_now_and_then(self, container: str) -> None:
         """At once, unless that was done a moment ago: then in a moment, once, however many events come till then."""
         with self._lock:
             if container in self._at_will:
                 self._at_will[container] = True
                 return
             self._at_will[container] = False
-        again = threading.Timer(AT_WILL_S, self._look_again, (container,))
+        again = threading.Timer(AT_WILL_S, self._inspect_again, (container,))
         again.daemon = True
         again.start()
         self.inspect(container)
 
-    def _look_again(self, container: str) -> None:
+    def _inspect_again(self, container: str) -> None:
         with self._lock:
             more = self._at_will.pop(container, False)
         if more and not self._closing.is_set():
             with suppress(RuntimeFailure):  # the next list says so, too
-                self._look_now_and_then(container)
+                self._inspect_now_and_then(container)
 
     def _end_stream(self) -> None:
         stream, self._stream = self._stream, None
@@ -375,11 +375,11 @@ class Follower:
                     self._awaited.discard(container)  # at once: whoever sees it run again has it watched again
                     return
             with suppress(RuntimeFailure):
-                self._look_ready(container)
+                self._check_ready(container)
             waited = time.monotonic() - began
             self._closing.wait(min(_READY_MOST_S, max(_READY_S, _READY_SHARE * waited)))
 
-    def _look_ready(self, container: str) -> None:
+    def _check_ready(self, container: str) -> None:
         with self._engine.asked():
             api = self._engine.api()
             # The SDK only knows how to fetch the file, which takes the engine 50 to 100 ms. It is put there in one

@@ -45,7 +45,7 @@ class ReportReader:
         """``running`` tells the containers to look at; it may raise what the engine's failure is."""
         self._engine = engine
         self._running = running
-        self._now_and_then = NowAndThen("docker-reports", _EVERY_S, clock, self._look_quietly)
+        self._now_and_then = NowAndThen("docker-reports", _EVERY_S, clock, self._refresh_quietly)
         self._known: Mapping[str, Known] = {}
 
     def of(self, container: str) -> tuple[ServiceReport, ...]:
@@ -62,7 +62,7 @@ class ReportReader:
         """Look at them, unless that is under way or was done a moment ago. Does not wait."""
         self._now_and_then.begin()
 
-    def _look_quietly(self) -> None:
+    def _refresh_quietly(self) -> None:
         try:
             self.refresh()
         except RuntimeFailure as error:
@@ -76,12 +76,12 @@ class ReportReader:
         """
         found: dict[str, Known] = {}
         for container in self._running():
-            known = self._look_at(container)
+            known = self._read(container)
             if known is not None:
                 found[container] = known
         self._known = found
 
-    def _look_at(self, container: str) -> Known | None:
+    def _read(self, container: str) -> Known | None:
         """None: it has reported nothing, or is gone."""
         api: Any = self._engine.api()  # a `Client`; told as the SDK's, which has no `fetch`
         with self._engine.asked():

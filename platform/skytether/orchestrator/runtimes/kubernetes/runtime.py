@@ -302,7 +302,7 @@ class KubernetesRuntime(Runtime):
         return self._observed(self._watch.seen(self.options.timeout_s), unrun)
 
     @override
-    def look_at(self, instances: Collection[str]) -> Mapping[str, Observation]:
+    def observe_some(self, instances: Collection[str]) -> Mapping[str, Observation]:
         there = [seen for instance in instances for seen in self._watch.of(instance, self.options.timeout_s)]
         with self._lock:
             unrun = {instance: self._unrun[instance] for instance in instances if instance in self._unrun}
