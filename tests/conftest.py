@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import pytest
 import slow_tests
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from one_run import begun_once, folder_of, turn
 from postgres_server import PostgresServer, own_server
 
@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 # How long an example takes says nothing on a machine that others use too. `make fuzz` is where to look for more.
 # The same examples each time: a test that fails for somebody fails for everybody. SKYTETHER_RANDOM=1 draws others.
 settings.register_profile(
-    "skytether", deadline=None, max_examples=30, derandomize=os.environ.get("SKYTETHER_RANDOM", "") == ""
+    "skytether",
+    deadline=None,
+    max_examples=30,
+    derandomize=os.environ.get("SKYTETHER_RANDOM", "") == "",
+    suppress_health_check=[HealthCheck.too_slow],  # as with the deadline: it goes by the clock
 )
 settings.load_profile("skytether")
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from stopping_oracle import Drive, Faults, deepest
 
@@ -126,7 +126,7 @@ seeds = st.integers(0, 2**32)
 
 
 @pytest.mark.slow
-@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60)
 @given(drives(10.0, 15.0, 30.0, 50.0, 100.0, 250.0, 500.0))
 def test_over_many_configurations_nothing_gets_into_the_stop_zone(drawn):
     drive, seconds = drawn
