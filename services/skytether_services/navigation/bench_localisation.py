@@ -293,6 +293,7 @@ def _kidnapped(
                 "estimate": np.round(estimate.pose, 2).tolist(),
                 "noticed_after_s": noticed,
                 "found_after_s": when,
+                "right": is_right(estimate, data.truth[index]),
                 "sure": estimate.sure,
                 "sure_and_wrong": wrong or (estimate.sure and when is None),
                 "way_in_map": round(float(seen.mean()), 2),
@@ -302,10 +303,12 @@ def _kidnapped(
     seconds = [row["found_after_s"] for row in rows if row["found_after_s"] is not None]
     return {
         "kidnaps": kidnaps,
+        "kidnaps_right": sum(row["right"] for row in rows),
         "kidnaps_found_again": len(seconds),
         "kidnaps_found_p95_s": round(float(np.percentile(seconds, 95)), 1) if seconds else None,
         "kidnaps_sure_and_wrong": sum(row["sure_and_wrong"] for row in rows),
         "kidnaps_in_map": sum(row["way_in_map"] >= IN_MAP for row in rows),
+        "kidnaps_in_map_right": sum(row["way_in_map"] >= IN_MAP and row["right"] for row in rows),
         "kidnaps_in_map_found_again": sum(
             row["way_in_map"] >= IN_MAP and row["found_after_s"] is not None for row in rows
         ),
