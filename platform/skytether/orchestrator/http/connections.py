@@ -74,7 +74,8 @@ class Connection:
     def end(self) -> None:
         """Close it, whatever it waits for."""
         if self.protocol is not None:
-            self.protocol.transport.abort()
+            with contextlib.suppress(AttributeError):  # uvicorn has closed it twice: see `skytether.api.splice.close`
+                self.protocol.transport.abort()
         elif self.socket is not None:
             with contextlib.suppress(OSError):  # it is gone already
                 # The loop has it while TLS is agreed upon: shut down, it ends there as if the other side had left.

@@ -43,7 +43,7 @@ from skytether.api.node import (
     line_of,
     read_request,
 )
-from skytether.api.splice import closed, keep_alive
+from skytether.api.splice import close, closed, keep_alive
 
 from ..config.settings import ServerLimits
 from ..domain.errors import DomainError, ForbiddenError, TooManyError, UnauthenticatedError
@@ -319,7 +319,7 @@ class NodeListener:
         if answer is not None:
             writer.write(line_of(answer))
             async with asyncio.timeout(ANSWER_S):
-                writer.close()
+                close(writer)
                 await writer.wait_closed()
 
     async def _answer(

@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from skytether.api.node import ANSWER_S, GO, MOST_WAYS, PING_S, SILENT_S, Said, Told, line_of
-from skytether.api.splice import PIECE, Stream, splice
+from skytether.api.splice import PIECE, Stream, close, splice
 
 from ..domain.rate_limit import RateLimiter
 from ..runtimes.base import ENGINE_AWAY, ENGINE_SOCKET
@@ -169,7 +169,7 @@ class Ways:
             task.cancel()
         while node.spare:
             (_, writer), done = node.spare.popleft()
-            writer.close()
+            close(writer)
             if not done.done():
                 done.set_result(None)
         while node.waiting:
