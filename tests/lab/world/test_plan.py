@@ -1,9 +1,11 @@
 import itertools
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from skytether.lab.world.occupancy import Occupancy
 from skytether.lab.world.people import CLEARANCE, Person
 from skytether.lab.world.plan import Box, PlanError, Walk, building, parse_plan, read_plan
 from skytether.lab.world.robot import RobotParams
@@ -75,6 +77,20 @@ def test_a_plan_of_ones_own_and_where_it_is_broken(tmp_path) -> None:
     file.write_text("name: hall\n")
     with pytest.raises(PlanError, match=r"hall\.yaml: the plan: goals is missing"):
         read_plan(file)
+
+
+def test_the_aisle_of_the_examples_leaves_1_4_m_beside_each_shelf() -> None:
+    plan = read_plan(Path(__file__).parents[3] / "docs" / "examples" / "aisle.yaml")
+    shelves = [box for box in plan.boxes if box.name.startswith("shelf")]
+    assert [box.x for box in shelves] == pytest.approx([1.8, 3.6, 5.4, 7.2, 9.0, 10.8])
+    sides = [-1, 1, -1, 1, -1, 1]
+    middles = np.array([(box.x, -side * 0.9) for box, side in zip(shelves, sides, strict=True)])
+    assert plan.clearance(middles) == pytest.approx(np.full(6, 0.7))
+    assert plan.bounds() == pytest.approx((-0.1, -1.7, 12.7, 1.7))
+    # The map of the drives that docs/navigation.md tells of; one that begins elsewhere makes others of them.
+    drawn = Occupancy(plan)
+    assert (drawn.grey.shape, drawn.origin) == ((88, 276), pytest.approx((-0.6, -2.2)))
+    assert (plan.starts[0], plan.goals) == ((0.7, 0.0, 0.0), ((11.9, 0.0, 0.0),))
 
 
 def test_a_person_waits_to_be_triggered_walks_pauses_and_is_done() -> None:

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from skytether.control.admittance import Velocity
+from skytether.lab.world.plan import Plan, building
+from skytether_services.navigation import bench_courses
 from skytether_services.navigation.bench_courses import (
     Course,
     Predictions,
     compared,
     delay_verdict,
     distance_from,
+    measure_delays,
     score,
     summed_up,
 )
@@ -94,6 +97,33 @@ def test_verdict_of_the_delays(given: Any, expected: tuple[bool, bool, bool]) ->
     assert (found["time_within_bar"], found["measured_beats_fixed"], found["measured_halves_off"]) == expected
 
 
+def test_the_time_is_judged_only_with_the_links_that_it_needs() -> None:
+    every = rows(0.1, 0.06, 0.05, 105.0)
+    some = [row for row in every if row["jitter"] or not row["round_trip"]]
+    found = delay_verdict(some)
+    assert found == {"measured_beats_fixed": True, "measured_halves_off": True}
+    assert delay_verdict(every) == {"time_within_bar": True, **found}
+
+
+def test_with_jitter_only_two_links_are_driven_through_the_plan_that_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    driven = []
+
+    def to_goals(plan: Plan, goals: int, params: Any, seed: int, link: Any) -> Course:
+        driven.append((plan.name, plan.people, goals, params["delay"]["compensation"], link.delay, link.loss, seed))
+        return Course("succeeded", 40.0, 0.01, 0.01, 0.001, 0)
+
+    monkeypatch.setattr(bench_courses, "_to_goals", to_goals)
+    monkeypatch.setattr(bench_courses, "compared", lambda _: [])  # SciPy takes long to load
+    found = measure_delays(plan=building(), goals=4, runs=2, seed=7, jitter_only=True, progress=lambda _: None)
+    links = [("measured", 0.0, 0.0), *((kind, 0.1, 0.02) for kind in ("off", "fixed", "measured"))]
+    assert driven == [("building", (), 4, *link, seed) for link in links for seed in (7, 8)]
+    assert "time_within_bar" not in found
+    assert found["plan"] == "building"
+    found = measure_delays(plan=building(), goals=4, runs=1, seed=7, jitter_only=False, progress=lambda _: None)
+    assert len(found["rows"]) == 6 * 3 + 2 * 2  # where the fixed one is told something else, none is without
+    assert found["time_within_bar"]
+
+
 def test_drives_over_one_link_are_summed_up_and_a_failed_one_is_told() -> None:
     courses = [Course("succeeded", 40.0, 0.02, 0.01, 0.001, 0), Course("failed", 44.0, 0.04, 0.03, 0.001, 1)]
     found = summed_up(courses)
@@ -108,9 +138,11 @@ def test_fixed_is_compared_with_measured_over_the_link_that_it_was_told_another_
         courses = [Course("succeeded", 40.0, error, 0.01, 0.001, 0) for error in errors]
         return {"round_trip": 0.35, "jitter": 0.0, "told": told, "compensation": kind, **summed_up(courses)}
 
-    rows = [row("fixed", 0.2, [3.0, 4.0, 5.0]), row("measured", 0.2, [1.0, 2.0, 3.0])]
+    rows = [row("fixed", 0.2, [3.0, 4.0, 5.0]), row("measured", 0.2, [2.0, 2.0, 2.0])]
     (found,) = compared(rows)  # the predictions do not differ at all
     assert (found["told"], found["error"]) == (0.2, "path_error")
-    # Two units apart, both with variance 1: t = 2 / sqrt(2/3).
-    assert found["t"] == pytest.approx(2.45)
-    assert found["p"] == pytest.approx(0.07, abs=0.01)
+    # In pairs 1, 2 and 3 apart, with variance 1: t = 2 / sqrt(1/3) of two degrees of freedom, whose 95 % are at 4.303.
+    assert (found["test"], found["difference"]) == ("paired", 2.0)
+    assert found["t"] == pytest.approx(3.46)
+    assert found["p"] == pytest.approx(0.074, abs=0.001)
+    assert (found["low"], found["high"]) == pytest.approx((2 - 4.303 / 3**0.5, 2 + 4.303 / 3**0.5), abs=0.001)

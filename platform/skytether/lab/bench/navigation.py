@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from skytether.lab.carmen import CarmenLog
 from skytether.lab.world.model import WorldError
+from skytether.lab.world.plan import Plan
 
 GROUP = "skytether.benches"
 
@@ -139,17 +140,29 @@ class StepBench(Protocol):
 class DelaysBench(Protocol):
     """The entry point ``navigation-delays``."""
 
-    def __call__(self, *, goals: int, runs: int, seed: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    def __call__(
+        self,
+        *,
+        plan: Plan,
+        goals: int,
+        runs: int,
+        seed: int,
+        jitter_only: bool,
+        progress: Callable[[str], None],
+    ) -> dict[str, Any]:
         """Drive over links of more and more delay, with each compensation.
 
         Args:
-            goals: So many of the building's.
+            plan: Of the world; its people are left out.
+            goals: So many of the plan's.
             runs: Over each link with each compensation.
             seed: The first of the world's noise and the link's.
+            jitter_only: Only the link with jitter and loss, and, measured, the one without delay.
             progress: Told before each drive.
 
         Returns:
-            ``time_within_bar, measured_beats_fixed, measured_halves_off``, ``fixed_against_measured`` (t-tests), and
+            ``time_within_bar`` (not with ``jitter_only``), ``measured_beats_fixed, measured_halves_off``,
+            ``fixed_against_measured`` (t-tests: ``test`` is how, ``paired``; ``difference, low, high, t, p``), and
             ``rows``: ``round_trip, jitter, loss, told, compensation, state, contacts``, and means over the runs, with
             ``_std`` and ``_each``: ``seconds, path_error, prediction_error, prediction_across``.
 

@@ -12,6 +12,7 @@ from rich.table import Table
 from skytether.lab.bench.mapping import ODOMETRY, bench_mapping
 from skytether.lab.bench.navigation import NavigationBenchError, bench_driving, bench_localisation
 from skytether.lab.carmen import CarmenError, read_log
+from skytether.lab.world.plan import PlanError, building, read_plan
 
 from ...output import console, fail, print_json
 
@@ -105,9 +106,26 @@ def navigation(
     trajectories: Annotated[
         int, typer.Option(min=10, max=20_000, help="That the controller tries in each step.")
     ] = 1000,
-    goals: Annotated[int, typer.Option(min=1, max=9, help="So many of the building's nine goals.")] = 9,
+    goals: Annotated[
+        int | None, typer.Option(min=1, help="So many of the goals; the building has nine. Default: all.")
+    ] = None,
     delays: Annotated[
         bool, typer.Option("--delays", help="Instead: over links of more and more delay, with each compensation.")
+    ] = False,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --delays: a plan of your own (YAML) instead of the building.",
+            exists=True,
+            dir_okay=False,
+            readable=True,
+        ),
+    ] = None,
+    jitter_only: Annotated[
+        bool,
+        typer.Option(
+            "--jitter-only", help="With --delays: only the link with jitter and loss, and measured without delay."
+        ),
     ] = False,
     cluttered: Annotated[
         int | None, typer.Option(min=1, max=1000, help="Instead: through so many fields of cylinders.")
@@ -126,10 +144,27 @@ def navigation(
     """
     if delays and cluttered is not None:
         fail("--delays and --cluttered are two benchmarks; give one of them", 2)
+    if not delays and (plan is not None or jitter_only):
+        fail(f"{'--plan' if plan is not None else '--jitter-only'} is for --delays; give it, too", 2)
+    try:
+        world = read_plan(plan) if plan is not None else building()
+    except (PlanError, OSError) as error:
+        fail(str(error), 2)
+    goals = goals or len(world.goals)
+    if goals > len(world.goals):
+        fail(f"--goals {goals} is too many: the plan '{world.name}' has {len(world.goals)}", 2)
     try:
         with console.status("loading ...") as line:
             if delays:
-                found = bench_driving("navigation-delays", goals=goals, runs=runs or 1, seed=seed, progress=line.update)
+                found = bench_driving(
+                    "navigation-delays",
+                    plan=world,
+                    goals=goals,
+                    runs=runs or 1,
+                    seed=seed,
+                    jitter_only=jitter_only,
+                    progress=line.update,
+                )
             elif cluttered is not None:
                 found = bench_driving(
                     "navigation-cluttered", worlds=cluttered, runs=runs or 10, seed=seed, progress=line.update
@@ -197,7 +232,10 @@ def _print_delays(found: dict[str, Any]) -> None:
     for test in found["fixed_against_measured"]:
         link = ", ".join(f"{name} {1000 * test[key]:.0f} ms" for name, key in _LINK)
         console.print(
-            f"{link}: {test['error']} of fixed against measured: t = {test['t']}, p = {test['p']:.2g}.", highlight=False
+            f"{link}: {test['error']} of fixed less measured, {test['test']} by seed: "
+            f"{1000 * test['difference']:.2f} mm, {1000 * test['low']:.2f} to {1000 * test['high']:.2f} (95 %): "
+            f"t = {test['t']}, p = {test['p']:.2g}.",
+            highlight=False,
         )
     for name, text in (
         ("time_within_bar", "At the longest round trip within 5 % of the time without delay"),
@@ -207,7 +245,8 @@ def _print_delays(found: dict[str, Any]) -> None:
         ),
         ("measured_halves_off", "and leaves at most half the path error of none"),
     ):
-        console.print(f"{text}: {'yes' if found[name] else 'no'}.", highlight=False)
+        if name in found:
+            console.print(f"{text}: {'yes' if found[name] else 'no'}.", highlight=False)
 
 
 _LINK = (("round trip", "round_trip"), ("jitter", "jitter"), ("told", "told"))
