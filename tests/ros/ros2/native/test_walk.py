@@ -75,7 +75,7 @@ class Walk:
         # The agent's first standstills, from before its node and the wheels have found each other.
         self.unheard = steady(lambda: self.agent.told - len(self.walker.told()))
         self.walker.begin()
-        until(lambda: self.agent.drives, "the service to drive")
+        until(lambda: self.agent.drives, "the service to drive", WALK_S)
 
     def finish(self):
         """To the end of the trail, and until all that was under way has come."""
