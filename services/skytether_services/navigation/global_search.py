@@ -226,6 +226,13 @@ _CLIMBS = 40
 _STEPS = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], float)
 
 
+_OPEN = 0.03
+"""Likelihood of a beam that ends in the open, where hypotheses are compared: it met something that the map lacks.
+
+From the right pose 5 % of the beams do and 7 % pass through something, from a wrong one 15 and 17 % (building 079).
+"""
+
+
 def judge(field: LikelihoodField, pose: Array, starts: Array, ends: Array, floor: Floor) -> Hypothesis:
     """How well beams and the floor that they crossed fit the map from one pose: by that score hypotheses are compared.
 
@@ -240,10 +247,14 @@ def judge(field: LikelihoodField, pose: Array, starts: Array, ends: Array, floor
     explained = explain(field, pose, starts, ends)
     if len(ends) == 0:
         return Hypothesis(pose, math.log(field.model.unknown) - against, explained)
-    near = math.log(field.model.outlier)
-    share = explained.known * explained.share
-    # Explained beams count 0, what the map does not know a little, the rest as outliers.
-    score = (1 - explained.known) * math.log(field.model.unknown) + (explained.known - share) * near
+    through = explained.known * explained.through
+    in_open = explained.known * (1 - explained.share) - through
+    # Explained beams count 0, what the map does not know a little.
+    score = (
+        (1 - explained.known) * math.log(field.model.unknown)
+        + through * math.log(field.model.outlier)
+        + in_open * math.log(_OPEN)
+    )
     return Hypothesis(pose, score - against, explained)
 
 

@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from skytether_services.navigation.global_search import search
+from skytether_services.navigation.global_search import judge, search
 from skytether_services.navigation.grid_map import GridMap
 from skytether_services.navigation.likelihood_field import likelihood_field, score_beams, score_poses
 from skytether_services.navigation.localisation import Localisation
 from skytether_services.navigation.log_odds import occupancy
 from skytether_services.navigation.poses import between, compose
 from skytether_services.navigation.scan_matching import scan_points
+from skytether_services.navigation.seen_floor import Floor
 
 from .test_scan_matching import ANGLES, room
 
@@ -47,6 +48,19 @@ def test_a_beam_through_a_wall_is_an_outlier_and_one_to_where_the_map_knows_noth
     assert through == pytest.approx(math.log(field.model.outlier))
     assert unknown == pytest.approx(math.log(field.model.unknown))
     assert off_the_map == pytest.approx(math.log(field.model.unknown))
+
+
+def test_a_beam_that_ends_in_the_open_speaks_against_a_place_more_than_one_through_what_the_map_shows() -> None:
+    cells = np.zeros((20, 90), np.int8)
+    cells[:, 40] = 100  # a wall at 4 m
+    cells[:, 60:] = -1
+    field = likelihood_field(GridMap(cells, 0.1, (0.0, 0.0, 0.0)))
+    starts, ends = np.zeros((3, 2)), np.array([[3.0, 0.0], [3.0, 0.01], [3.0, -0.01]])
+    poses = np.array([[x, 1.05, 0.0] for x in (1.05, 4.55, 2.45, 0.45)])
+    floor = Floor(np.zeros((0, 2)), np.zeros((0, 2)))
+    explained, unknown, through, in_the_open = (judge(field, pose, starts, ends, floor).score for pose in poses)
+    assert explained == pytest.approx(0.0)
+    assert in_the_open < through < unknown < explained
 
 
 def test_a_pose_that_the_map_contradicts_gives_way_to_one_that_it_explains() -> None:
