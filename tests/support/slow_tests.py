@@ -161,6 +161,7 @@ ALONE = (
     "orchestrator/http/test_server.py::test_at_shutdown_what_was_asked",
     "orchestrator/http/test_server.py::test_killed_in_the_middle_of_starting",
     "orchestrator/http/test_server.py::test_watchers_do_not_hold_up_the_end",
+    "ros/ros2/native/test_walk.py",
 )
 """Among those the ones that look at the clock."""
 
