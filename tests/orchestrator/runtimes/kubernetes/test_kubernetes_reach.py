@@ -18,6 +18,7 @@ from kubernetes_house import OPERATOR, House
 from kubernetes_site import KubernetesSite
 
 from skytether.api.rest import State
+from skytether.orchestrator.runtimes.base import Phase
 
 pytestmark = [pytest.mark.slow, pytest.mark.docker, pytest.mark.kubernetes]
 
@@ -152,9 +153,10 @@ def test_a_load_balancer_that_gives_no_address_is_given_up(kubernetes_site: Kube
 
         def given_up() -> bool:
             runtime.tidy()
-            return runtime.observe()["i1"].unstarted
+            return runtime.observe()["i1"].phase is Phase.EXITED
 
         until(given_up, 90.0)
+        assert runtime.observe()["i1"].unstarted
         assert runtime.observe()["i1"].detail == (
             "could not be started: the cluster's load balancer has given its Service no address within 1 s "
             "(option 'reach')"
