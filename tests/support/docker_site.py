@@ -174,10 +174,11 @@ class DockerSite:
         return self.docker("volume", "ls", "-q", *filters).split()
 
     def clean(self) -> None:
-        """Remove containers and data."""
+        """Remove containers and data, that of sites too whose owner's name is longer by something."""
+        longer = self.docker("volume", "ls", "-q", "--filter", f"name=skytether-{self.owner}-").split()
         for kind, names in (
             ("container", self.containers() + self.helpers()),
-            ("volume", self.volumes_with()),
+            ("volume", sorted({*self.volumes_with(), *longer})),
         ):
             if names:
                 self.docker(kind, "rm", *(["-f", "-v"] if kind == "container" else ["-f"]), *names)
