@@ -29,7 +29,7 @@ def main(statuses: list[int]) -> int:
         _say(f"Tests failed: {len(failed)}. At most {MOST} are run again, and only if all parts ran to their end.")
         return 1
     _say(f"What failed is run once more, one at a time: {len(failed)} ...")
-    if subprocess.run([sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *failed]).returncode:
+    if subprocess.run([sys.executable, "-m", "pytest", *failed]).returncode:
         _say("It failed alone, too.")
         return 1
     _say("They passed. Each is a finding all the same, for the product is wrong, or the test:")

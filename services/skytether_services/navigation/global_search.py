@@ -74,8 +74,8 @@ class Hypothesis:
 
     Attributes:
         pose: x [m], y [m], heading [rad], map frame.
-        score: Mean log-likelihood of a beam; one through a wall counts as an outlier. Less what the map says against
-            the floor that was seen.
+        score: Mean log-likelihood of a beam; one through a wall counts as an outlier, one that ends in the open as a
+            little more. Less what the map says against the floor that was seen.
         explained: How the map explains the beams from there.
     """
 

@@ -139,26 +139,27 @@ class Pair:
         self.close()
 
     def _carried(self, order: Order) -> tuple[Carried | None, float | None]:
-        """What enters the link, both ways, while the order counts, and the most that a packet was late [ms]; waits."""
-        before, _ = self._counters_at(order.start)
-        after, late = self._counters_at(order.end)
-        if before is None or after is None:
-            return None, late
-        return Carried(before[0], after[0], after[1] - before[1]), late
+        """What enters the link, both ways, while the order counts, and the most that a packet was late [ms]; waits.
 
-    def _counters_at(self, when: float) -> tuple[tuple[float, int] | None, float | None]:
+        None of either without a link.
+        """
+        if self._link is None:
+            return None, None
+        since, before, _ = self._counters_at(self._link, order.start)
+        until, after, late = self._counters_at(self._link, order.end)
+        return Carried(since, until, after - before), late
+
+    def _counters_at(self, link: Connection, when: float) -> tuple[float, int, float]:
         """The moment, a bit late on a busy machine, and bytes of IP packets that had entered the link, both ways.
 
         And the most that one was late [ms].
         """
         time.sleep(max(0.0, when - time.monotonic()))
-        if self._link is None:
-            return None, None
-        self._link.send("counters")
-        counted_at, counters = self._receive(self._link)
+        link.send("counters")
+        counted_at, counters = self._receive(link)
         both: list[LinkCounters] = list(counters.values())
         entered = sum(c.bytes_received + c.received * IP_UDP_HEADERS for c in both)
-        return (counted_at, entered), round(max(c.late_max for c in both) * 1000, 3)
+        return counted_at, entered, round(max(c.late_max for c in both) * 1000, 3)
 
     def _receive(self, pipe: Connection) -> Any:
         try:
