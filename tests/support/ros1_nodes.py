@@ -9,8 +9,10 @@ BEFORE = """
 import json, sys, threading, time
 import rospy
 
+lock = threading.Lock()
 def say(what):
-    print(json.dumps(what), flush=True)
+    with lock:  # rospy's threads may say something at once
+        print(json.dumps(what), flush=True)
 """
 _AFTER = """
 say("ready")

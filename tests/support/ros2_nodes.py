@@ -35,8 +35,10 @@ def qos(reliable=True, latched=False, depth=10):
         durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
     )
 
+lock = threading.Lock()
 def say(what):
-    print(json.dumps(what) + "\\n", end="", flush=True)  # in one, for threads may say something, too
+    with lock:  # threads may say something at once
+        print(json.dumps(what), flush=True)
 
 rclpy.init()
 node = rclpy.create_node(NAME, namespace=NAMESPACE)

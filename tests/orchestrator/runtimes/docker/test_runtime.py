@@ -442,10 +442,10 @@ def test_a_port_that_is_taken(docker_site: DockerSite, tmp_path: Path) -> None:
 
 
 @contextmanager
-def checked(site: DockerSite, folder: Path, check: str) -> Iterator[str]:
+def checked(site: DockerSite, folder: Path, check: str, timeout: str) -> Iterator[str]:
     """An image of the toy with another health check, which is asked often."""
     image = site.images.name("checked")
-    often = "--interval=200ms --timeout=500ms --start-period=1ms --retries=2"
+    often = f"--interval=200ms --timeout={timeout} --start-period=1ms --retries=2"
     (folder / "Dockerfile").write_text(f"FROM {site.images.toy}\nHEALTHCHECK {often} CMD {check}\n")
     environment = {**os.environ, "DOCKER_BUILDKIT": "0"}
     subprocess.run(
@@ -458,7 +458,7 @@ def checked(site: DockerSite, folder: Path, check: str) -> Iterator[str]:
 
 
 def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
-    with checked(docker_site, tmp_path, '["/bin/sh", "-c", "echo its arm is stuck; exit 1"]') as image:
+    with checked(docker_site, tmp_path, '["/bin/sh", "-c", "echo its arm is stuck; exit 1"]', "20s") as image:
         runtime.start(launch(docker_site, image=image))
         until(lambda: (seen := runtime.observe()["i1"]).phase is Phase.RUNNING and seen.detail == "its arm is stuck")
         runtime.remove("i1")
@@ -466,7 +466,7 @@ def test_an_ill_container_says_so(docker_site: DockerSite, runtime: DockerRuntim
 
 def test_who_is_asked_too_slowly_is_not_ill(docker_site: DockerSite, runtime: DockerRuntime, tmp_path: Path) -> None:
     """As on a machine that is so busy that no check of a health ends in time."""
-    with checked(docker_site, tmp_path, '["sleep", "600"]') as image:
+    with checked(docker_site, tmp_path, '["sleep", "600"]', "500ms") as image:
         runtime.start(launch(docker_site, image=image))
         until_phase(runtime, Phase.RUNNING)
         (container,) = docker_site.containers()

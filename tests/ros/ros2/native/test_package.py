@@ -45,11 +45,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, GetParameters
 
-lock, one_says = threading.Lock(), say
-def say(what):  # two threads do
-    with lock:
-        one_says(what)
-
 def heard(message):
     for status in message.status:
         values = {pair.key: pair.value for pair in status.values}

@@ -151,7 +151,7 @@ class Program:
             except ExternalShutdownException:
                 break
             except Exception as error:  # one bad message or request must not end the node
-                self._send(what="trouble", channel=0, why=f"{type(error).__name__}: {error}")
+                self._report(0, error)
         code = 0 if self._ended.is_set() else SHUT_DOWN
         self._leave()
         return code
@@ -179,6 +179,12 @@ class Program:
     def _send(self, **what: Any) -> None:
         self._sender.put(control(**what))
 
+    def _report(self, channel: int, error: Exception) -> None:
+        """Tell what went wrong; where ROS 2 was shut down nothing can go well, and the exit code tells of that."""
+        if rclpy.ok():
+            said = str(error) if isinstance(error, types.NotInstalledError) else f"{type(error).__name__}: {error}"
+            self._send(what="trouble", channel=channel, why=said)
+
     # --- from the agent ----------------------------------------------------------------------------------------------
 
     def _read(self, stream: Any) -> None:
@@ -192,10 +198,8 @@ class Program:
                 return
             try:
                 self._do(frame)
-            except types.NotInstalledError as error:
-                self._send(what="trouble", channel=frame.channel, why=str(error))
             except Exception as error:
-                self._send(what="trouble", channel=frame.channel, why=f"{type(error).__name__}: {error}")
+                self._report(frame.channel, error)
 
     def _do(self, frame: Frame) -> None:
         if frame.kind is Kind.DATA:
@@ -216,7 +220,7 @@ class Program:
             try:
                 getattr(self, f"_do_{what.pop('do')}")(**what)
             except types.NotInstalledError as error:
-                self._send(what="trouble", channel=what.get("channel", 0), why=str(error))
+                self._report(what.get("channel", 0), error)
         elif frame.kind is Kind.REQUEST:
             self._call(frame.channel, *pull_number(frame.body))
         elif frame.channel in self._servers:
