@@ -30,6 +30,8 @@ WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
     b'"VolumeOptions": {"NoCopy": true}}], "CapDrop"',
 )
 
+VOLUME = b'{"Name": "skytether-main_state", "Labels": {"skytether.io/owner": "edge"}}'
+
 
 class Engine:
     """Answers, and keeps what it was asked."""
@@ -482,6 +484,7 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
         (request("POST /containers/create", CREATED % f"container:{OTHER}".encode()), b"is not of an orchestrator"),
         (request("POST /networks/bridge/connect", b'{"Container": "%s"}' % ID.encode()), b"bridge is not of"),
         (request("POST /containers/create", WITH_VOLUME), b"skytether-main_state is not of an orchestrator"),
+        (request("POST /volumes/create", VOLUME), b"skytether-main_state is not of an orchestrator"),
         (request("POST /containers/database%2Fexec", b"{}"), b"nothing that a site needs"),
         (request("POST /containers/create", b'{"HostConfig": {"Binds": ["/:/host"]}}'), b"'Binds'"),
         (request("GET /info", b"POST /build HTTP/1.1\r\n\r\n"), b"its body is no JSON"),

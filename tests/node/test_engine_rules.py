@@ -150,7 +150,12 @@ def named(**options: Any) -> dict[str, Any]:
     return {"Type": "volume", "Source": "skytether-a", "Target": "/d", "VolumeOptions": options}
 
 
+def log(**options: str) -> dict[str, Any]:
+    return {"Type": "json-file", "Config": {"max-size": "2m", "max-file": "2", **options}}
+
+
 HOST: dict[str, Any] = {
+    "LogConfig": log(),
     "NetworkMode": "skytether",
     "CapDrop": ["ALL"],
     "SecurityOpt": SECURITY,
@@ -207,6 +212,9 @@ HOST: dict[str, Any] = {
         ({"Tmpfs": ["/sys/"]}, "is mounted by"),
         ({"Devices": [{"PathOnHost": "/dev/sda"}]}, "by `site join --device /dev/sda`"),
         ({"Devices": [{"PathOnHost": "/dev/video0", "pathonhost": "/dev/sda"}]}, "a device has 'pathonhost'"),
+        # In a volume that others have, on a way that they move as it is made: it would be anywhere on the machine.
+        ({"Devices": [{"PathOnHost": "/dev/video0", "PathInContainer": "/d/a/b"}]}, "/dev/video0 at another path"),
+        ({"Devices": ["/dev/video0"]}, "it has the device /dev/video0"),
         ({"DeviceRequests": [{"Driver": "cdi", "DeviceIDs": ["vendor.com/all=all"]}]}, "odd devices"),
         ({"DeviceRequests": [gpu("0")]}, "by `site join --device /dev/nvidia0`"),
         ({"DeviceRequests": [gpu("0/../sda")]}, "by `site join --device /dev/nvidia0/../sda`"),
@@ -215,6 +223,13 @@ HOST: dict[str, Any] = {
         ({"LogConfig": {"Type": "syslog"}}, "its log goes elsewhere"),
         # To an engine whose own kind of log goes elsewhere, it says where to.
         ({"LogConfig": {"Config": {"syslog-address": "udp://127.0.0.1:53"}}}, "its log goes elsewhere"),
+        # Of a template, an engine makes a text of any length as it starts it: gigabytes of its own memory.
+        ({"LogConfig": log(tag='{{pad "a" 100000000000 0}}')}, "its log has tag"),
+        ({"LogConfig": log(mode="non-blocking")}, "its log has mode 'non-blocking'"),
+        ({"LogConfig": log(**{"max-size": "99999m"})}, "its log has max-size '99999m'"),
+        ({"LogConfig": log(**{"max-file": "1000000000"})}, "its log has max-file"),
+        ({"LogConfig": log(**{"Max-File": "2"})}, "its log has Max-File"),
+        ({"LogConfig": {"Type": "json-file", "Config": ["tag"]}}, "its log has"),
         ({"NetworkMode": None}, "its network is ''"),  # and not the network of that name
         ({"ReadonlyRootfs": False}, "it may change its own files"),
         ({"ReadonlyRootfs": None}, "it may change its own files"),
@@ -304,6 +319,8 @@ def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are()
     made["HostConfig"] = HOST
     assert judge(Call("POST", "/containers/create", {}, made)) == (None, (("joined networks", "skytether"),))
     assert judge(Call("DELETE", "/networks/skytether-n", {}, None)) == (None, (("networks", "skytether-n"),))
+    volume = {"Name": "skytether-a", "Labels": OWNER}  # what is there by that name, an engine tells all of
+    assert judge(Call("POST", "/volumes/create", {}, volume)) == (None, (("volumes", "skytether-a"),))
     assert judge(Call("PUT", f"/containers/{ID}/archive", {"path": "/run/skytether"}, None)) == (
         None,
         (("containers", ID),),

@@ -95,6 +95,10 @@ _TMPFS = re.compile(r"(?:(?:size|mode|uid|gid|nr_inodes)=[0-9]+[kmg]?|nosuid|nod
 _MOST_PIDS = 1 << 15
 """Of a container's processes and threads."""
 _JSON_FILE = {"Type": "json-file"}
+_LOG_OPTIONS = {"max-size": re.compile("[1-9][0-9]{0,3}[km]"), "max-file": re.compile("[1-9][0-9]?")}
+"""Of a log. By others an engine does what costs the machine and not the container: of a ``tag`` it makes a text, by a
+template that may ask for one of any length, and so of any memory; and it keeps lines in memory where it need not wait.
+"""
 _MOST_PORTS = 1
 """Published: each costs the machine a process of root or two."""
 
@@ -158,7 +162,7 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> _Judgeme
         case "network made":
             return _network(body), ()
         case "volume made":
-            return _volume(body), ()
+            return _volume(body), (("volumes", _text(body, "Name")),)  # or an engine tells what it is that is there
         case "prune":
             return _pruned(call), ()
         case "pull":
@@ -249,6 +253,7 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         # Without a type, an engine gives what is set here to its own kind of log, which may be one that goes elsewhere.
         None if (_at(host, "LogConfig") or _JSON_FILE).get("Type") == "json-file" else "its log goes elsewhere",
         _only(_at(host, "LogConfig"), {"Type", "Config"}, "a log"),
+        *(_log_option(key, value) for key, value in _at(_at(host, "LogConfig"), "Config").items()),
         *(_tmpfs(path, options) for path, options in _at(host, "Tmpfs").items()),
         *(_mount(mount) for mount in _list(host, "Mounts")),
         *(_device(one, devices) for one in _list(host, "Devices")),
@@ -282,6 +287,13 @@ def _tmpfs(path: str, options: Any) -> str | None:
     return f"its file system in memory at {path[:80]} is mounted by '{odd[0][:40]}'" if odd else None
 
 
+def _log_option(key: str, value: Any) -> str | None:
+    known = _LOG_OPTIONS.get(key)
+    if known and isinstance(value, str) and known.fullmatch(value):
+        return None
+    return f"its log has {key[:40]} '{str(value)[:40]}', which no site asks for"
+
+
 def _mount(mount: Any) -> str | None:
     if not isinstance(mount, dict) or mount.get("Type") != "volume":
         return "it mounts something of this machine"
@@ -299,7 +311,10 @@ def _mount(mount: Any) -> str | None:
 
 def _device(device: Any, devices: set[str]) -> str | None:
     path = device.get("PathOnHost") if isinstance(device, dict) else device
-    if isinstance(path, str) and path in devices:
+    if isinstance(device, dict) and isinstance(path, str) and path in devices:
+        if device.get("PathInContainer", path) != path:
+            # In a volume, an engine makes it on a way that others move meanwhile, to anywhere on the machine.
+            return f"it has the device {path[:80]} at another path"
         return _only(device, {"PathOnHost", "PathInContainer", "CgroupPermissions"}, "a device")
     return f"it has the device {str(path)[:80]}, and this machine gives none but by `site join --device {path}`"
 
