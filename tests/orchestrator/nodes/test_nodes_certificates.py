@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from skytether.node import calls
 from skytether.node.calls import RefusedError, trusting
 from skytether.node.run import NodeProgram
 from skytether.node.store import NodeError, NodeStore, new_key, renew_due, request_for
-from skytether.orchestrator.nodes.authority import serial_of
+from skytether.orchestrator.nodes.authority import Authority, serial_of
 
 DAY = 86_400.0
 
@@ -31,6 +32,17 @@ def ask(nodes: NodeScene, trust: Any) -> Stands:
 def test_a_certificate_is_due_after_two_thirds_of_its_life() -> None:
     assert not renew_due(0.0, 30 * DAY, 20 * DAY - 1)
     assert renew_due(0.0, 30 * DAY, 20 * DAY)
+
+
+@pytest.mark.parametrize("days", [0.01, 0.5, 1.0, 30.0])
+def test_no_certificate_is_due_as_it_is_made(tmp_path: Path, days: float) -> None:
+    """It begins earlier, for clocks that are behind; a machine that renews while it joins has joined by another one."""
+    now = 1000 * DAY
+    made = Authority(tmp_path, lambda: now).sign(request_for(new_key()), "edge", days)
+    begins, ends = made.not_valid_before_utc.timestamp(), made.not_valid_after_utc.timestamp()
+    assert begins < now < ends
+    assert not renew_due(begins, ends, now + days * DAY / 4)
+    assert renew_due(begins, ends, now + days * DAY * 2 / 3)
 
 
 def test_a_node_renews_in_time_and_the_certificate_before_is_worth_nothing_once_the_new_one_was_shown(

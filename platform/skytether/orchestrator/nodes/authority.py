@@ -28,7 +28,7 @@ from ..domain.security import SecretFileError, secret_file
 KEY = "nodes.key"
 _DAY = 86_400.0
 _BACKDATED_S = _DAY
-"""Certificates are good from so long before: a node's clock may be behind."""
+"""Certificates are good from so long before, at most: a node's clock may be behind."""
 _OURS_S = 90 * _DAY
 """For how long the orchestrator's are good."""
 _OURS_RENEWED_S = 30 * _DAY
@@ -98,7 +98,8 @@ class Authority:
         Raises:
             InvalidError: It is no request, or whoever sent it has not the key.
         """
-        begins = datetime.fromtimestamp(self._clock() - _BACKDATED_S, UTC)
+        # No longer before than after, or two thirds of it, when a node renews it, are over as it joins.
+        begins = datetime.fromtimestamp(self._clock() - min(_BACKDATED_S, days * _DAY), UTC)
         return self._sign(requested_key(request), name, begins, days * _DAY, server=False)
 
     def _sign(
