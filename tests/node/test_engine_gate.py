@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import gzip
+import io
 import json
 import socketserver
+import tarfile
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -173,11 +176,63 @@ def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine
     assert got == b'{"Memory": 2}'
 
 
-def test_an_archive_is_passed_on_as_it_is(engine: Engine) -> None:
-    archive = bytes(range(256)) * 1000
+def tar(*entries: tuple[str, bytes, str | bytes], form: int = tarfile.USTAR_FORMAT, **more: Any) -> bytes:
+    """Name, type, and what is in it or what it links to."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=form) as made:
+        for name, kind, content in entries:
+            entry = tarfile.TarInfo(name)
+            entry.type, entry.mode, entry.uid, entry.gid = kind, 0o400, 65532, 65532
+            for key, value in more.items():
+                setattr(entry, key, value)
+            if isinstance(content, str):
+                entry.linkname = content
+            else:
+                entry.size = len(content)
+            made.addfile(entry, io.BytesIO(content) if isinstance(content, bytes) else None)
+    return buffer.getvalue()
+
+
+FOLDER, FILE, LINK = tarfile.DIRTYPE, tarfile.REGTYPE, tarfile.SYMTYPE
+GRANT = (("instance", FOLDER, b""), ("data", FOLDER, b""), ("data/i-1", FOLDER, b""))
+
+
+def test_an_archive_with_a_grant_is_passed_on_as_it_is(engine: Engine) -> None:
+    archive = tar(*GRANT, ("instance/grant.json", FILE, bytes(range(256)) * 1000))
     assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive))
     line, _, got = engine.asked[-1]
     assert (line, got) == (f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
+
+
+@pytest.mark.parametrize(
+    "archive",
+    [
+        tar(("a", LINK, "/"), ("a/dev", LINK, "/etc")),
+        tar(("instance", LINK, "/")),
+        tar(("instance/grant.json", LINK, "/etc/shadow")),
+        tar(("instance/grant.json", tarfile.LNKTYPE, "data")),
+        tar(("instance/grant.json", tarfile.FIFOTYPE, b"")),
+        tar(("instance/grant.json", tarfile.CHRTYPE, b"")),
+        tar(("data/../../etc", FOLDER, b"")),
+        tar(("data/..", FOLDER, b"")),
+        tar(("/instance", FOLDER, b"")),
+        tar(("instance/other", FILE, b"a")),
+        tar(("instance/grant.json", FILE, b"a"), form=tarfile.PAX_FORMAT, pax_headers={"path": "a"}),
+        tar(("instance/grant.json", FILE, b"a"), uid=-1, form=tarfile.GNU_FORMAT),
+        tar(("instance/" + "a" * 200, FILE, b"a"), form=tarfile.GNU_FORMAT),
+        tar(*GRANT) + tar(("a", LINK, "/")),  # some look behind the end
+        tar(*GRANT)[:1024] + b"a" * 512,
+        tar(("instance/grant.json", FILE, b"a" * 2000))[:1500],
+        tar(*GRANT * 10),
+        gzip.compress(tar(*GRANT)),
+        b"a" * 60_000,
+    ],
+)
+def test_no_archive_changes_the_root_of_a_container(engine: Engine, archive: bytes) -> None:
+    """An engine unpacks from the outside and follows links: with `/dev` one, runc makes files on the machine."""
+    sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
+    assert b"something else than folders of ours and a grant" in say(engine, sent)
+    assert not any(line.startswith("PUT") for line in engine.lines)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +260,8 @@ def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -
     async def run() -> None:
         gate, engine_s = EngineGate(engine.path), AsyncMock(asyncio.StreamWriter, write=Mock())
         reader = asyncio.StreamReader()
-        sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", b"a" * 60_000)
+        archive = tar(("instance/grant.json", FILE, b"a" * 60_000))
+        sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
         reader.feed_data(sent[:-1])
         way = asyncio.create_task(gate.pass_requests((reader, engine_s), (reader, engine_s)))
         while reader._buffer:  # type: ignore[attr-defined]  # noqa: SLF001 asyncio's own
@@ -216,7 +272,7 @@ def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -
         reader.feed_data(sent[-1:])
         reader.feed_eof()
         await way
-        assert engine_s.write.call_args.args[0].endswith(b"a" * 60_000)
+        assert engine_s.write.call_args.args[0].endswith(archive)
 
     asyncio.run(run())
 

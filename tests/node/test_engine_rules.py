@@ -9,6 +9,7 @@ import pytest
 
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
+from skytether.node.archives import cleaned
 from skytether.node.engine_rules import Call, judge
 from skytether.node.seccomp_rules import holds
 from skytether.orchestrator.runtimes.base import Launch
@@ -97,6 +98,7 @@ def test_of_files_in_containers_those_are_passed_on_that_the_runtime_asks_for() 
     for file in (READY, REPORTS):
         assert asked("HEAD", path, path=file) is asked("GET", path, path=file) is None
     assert asked("PUT", path, path=grant_archive(launch())[0]) is None
+    assert cleaned(grant_archive(launch())[1]) == grant_archive(launch())[1]
     for odd in ("/", "/etc/shadow", "/run/skytether/data/a", f"{READY}/..", ""):
         assert {"is no file" in str(asked(method, path, path=odd)) for method in ("HEAD", "GET", "PUT")} == {True}
     assert asked("GET", path)

@@ -3,15 +3,21 @@
 For that, engines mount its volumes at the paths of its files, from the outside: look whether there is a link on the
 way, then mount. Whoever can move a folder on that way in between has his volume mounted anywhere on the machine. So
 all of the way must be such that nobody moves it: files that do not change, and no link to where they do.
+
+Whoever unpacks an archive could change them all the same, by a link in it: an engine unpacks into a container's root
+from the outside, follows links in there, and minds no root that is mounted read-only. With ``/dev`` a link there, runc
+makes files in what that is on the machine. So of archives a grant is passed on, written anew.
 """
 
 from __future__ import annotations
 
 import base64
+import io
 import json
 import posixpath
 import re
 import secrets
+import tarfile
 from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from pathlib import PurePosixPath
@@ -32,6 +38,46 @@ _LINK, _NO_FILE = 1 << 27, 1 << 19
 _USERS = {"/etc/passwd", "/etc/group"}
 """An engine reads them as it starts a container: of a pipe it waits for ever, of a device it takes all that comes."""
 _KNOWN = 4096
+_BLOCK = 512
+_FOLDERS, _GRANT = re.compile(r"instance|data(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80})?"), "instance/grant.json"
+"""What is put below `FOLDER`."""
+_MOST_ENTRIES = 16
+_MOST_ID = 1 << 20
+"""Of a user."""
+
+
+def cleaned(archive: bytes) -> bytes | None:
+    """An archive with the same folders and the same grant, and nothing else; None: there is something else in it.
+
+    Its heads are read one by one: what says of the next one how it is to be read is something else.
+    """
+    buffer, place = io.BytesIO(), 0
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for _ in range(_MOST_ENTRIES):
+            head = archive[place : place + _BLOCK]
+            if not head.strip(b"\0"):
+                return _ended(tar, buffer) if not archive[place:].strip(b"\0") else None
+            try:
+                entry = tarfile.TarInfo.frombuf(head, "ascii", "strict")
+            except (tarfile.TarError, ValueError):
+                return None
+            made, content = tarfile.TarInfo(entry.name), b""
+            if entry.type == tarfile.REGTYPE and entry.name == _GRANT and entry.size >= 0:
+                content = archive[place + _BLOCK : place + _BLOCK + entry.size]
+            elif entry.type != tarfile.DIRTYPE or not _FOLDERS.fullmatch(entry.name):
+                return None
+            if len(content) != entry.size or not (0 <= entry.uid < _MOST_ID and 0 <= entry.gid < _MOST_ID):
+                return None
+            made.type, made.mode, made.uid, made.gid = entry.type, entry.mode & 0o777, entry.uid, entry.gid
+            made.size = len(content)
+            tar.addfile(made, io.BytesIO(content))
+            place += _BLOCK + -(-len(content) // _BLOCK) * _BLOCK
+    return None
+
+
+def _ended(tar: tarfile.TarFile, buffer: io.BytesIO) -> bytes:
+    tar.close()
+    return buffer.getvalue()
 
 
 def moved(inspected: Mapping[str, Any]) -> str | None:

@@ -21,7 +21,7 @@ from skytether.api.printable import printable
 from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
-from .archives import Images, moved, ways
+from .archives import Images, cleaned, moved, ways
 from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
 from .machine import Answer, ask
 from .registries import Registries
@@ -143,6 +143,11 @@ class EngineGate:
             except (ValueError, RecursionError):
                 raise RefusedCall("its body is no JSON") from None
             await self._check(Call(method, unquote(path), query, said))
+            if archive:
+                made = cleaned(body)
+                if made is None:
+                    raise RefusedCall("its archive has something else than folders of ours and a grant")
+                body = made
             target = path + (f"?{urlencode(query)}" if query else "")
             if answered := self._answered(method, plain(unquote(path)), target, said):
                 await _answer(back, *await answered)
