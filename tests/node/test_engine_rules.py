@@ -371,6 +371,9 @@ NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ
         ({"names": ["clone3", "mount"], "action": "SCMP_ACT_ERRNO", "errnoRet": 38}, True),
         (allowed("read", "unshare"), False),
         (allowed("read", "io_uring_setup"), False),
+        (allowed("read", "unshare\0"), False),  # in C, that is where the name ends
+        ({"name": "unshare\0a", "action": "SCMP_ACT_ALLOW"}, False),
+        ({"names": [["unshare"]], "action": "SCMP_ACT_ALLOW"}, False),
         ({"name": "mount", "action": "SCMP_ACT_ALLOW"}, False),
         (allowed("unshare", includes={"caps": ["CAP_NET_ADMIN"]}), False),
         (allowed("unshare", includes={"arches": ["amd64"]}), False),

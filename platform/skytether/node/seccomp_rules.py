@@ -1,12 +1,14 @@
 """Whether a seccomp profile holds a container at least as an engine's own does. Pure.
 
 What gives a process a namespace, a file system or a part of the kernel that its container has not must be refused. An
-engine reads keys in any case, and of a key that stands twice both: only exact keys are taken, each of them once.
+engine reads keys in any case, and of a key that stands twice both: only exact keys are taken, each of them once, and
+plain names of calls.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,6 +34,7 @@ _WAYS_OUT = {
     *("open_tree_attr", "uselib", "ustat", "sysfs", "_sysctl", "iopl", "ioperm", "lookup_dcookie", "vm86old"),
     *("add_key", "keyctl", "request_key", "quotactl", "swapon", "swapoff", "acct", "syslog", "nfsservctl", "vm86"),
 }
+_CALL = re.compile("[a-z_][a-z0-9_]*")
 _NEW_NAMESPACES = 0x7E020000
 """Flags of ``clone``."""
 _FLAGS_SECOND = {"s390", "s390x"}
@@ -70,8 +73,13 @@ def _closed(entry: Mapping[str, Any]) -> bool:
         return False
     if entry.get("action") in _REFUSES or set(map(str, includes.get("caps") or [])) - _GUARDS:
         return True
-    allowed = {*map(str, names), str(entry.get("name"))}
-    return not allowed & _WAYS_OUT and ("clone" not in allowed or _within(entry.get("args"), includes.get("arches")))
+    allowed = [*names, *filter(None, [entry.get("name")])]
+    # Another spelling may mean one of them all the same: what looks it up in C ends it at its first zero.
+    if not all(isinstance(name, str) and _CALL.fullmatch(name) for name in allowed):
+        return False
+    return not _WAYS_OUT & set(allowed) and (
+        "clone" not in allowed or _within(entry.get("args"), includes.get("arches"))
+    )
 
 
 def _within(arguments: Any, arches: Any) -> bool:
