@@ -209,6 +209,7 @@ HOST: dict[str, Any] = {
         ({"Tmpfs": {"/sys/": "remount,rw"}}, "at /sys/ is mounted by 'remount'"),
         ({"Tmpfs": {"/tmp": "size=1m", "/link/to/sys": "rw,nosuid,remount"}}, "is mounted by 'remount'"),
         ({"Tmpfs": {"/tmp": "rbind"}}, "is mounted by 'rbind'"),
+        ({"Tmpfs": {"/link/../a": "size=1m"}}, "its file system in memory is at /link/../a"),
         ({"Tmpfs": {"/tmp": "shared"}}, "is mounted by 'shared'"),
         ({"Tmpfs": {"/tmp": ["remount"]}}, "is mounted by"),
         ({"Tmpfs": ["/sys/"]}, "is mounted by"),

@@ -283,6 +283,9 @@ def _network_name(name: str) -> str | None:
 
 
 def _tmpfs(path: str, options: Any) -> str | None:
+    if ".." in path.split("/"):
+        # Where an image has a link before that, it is another path than it reads as: in a volume that others move.
+        return f"its file system in memory is at {path[:80]}"
     odd = [one for one in str(options).split(",") if one and not _TMPFS.fullmatch(one)]
     return f"its file system in memory at {path[:80]} is mounted by '{odd[0][:40]}'" if odd else None
 
