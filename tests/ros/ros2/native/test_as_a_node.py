@@ -136,6 +136,58 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
     ]
 
 
+def test_a_program_that_hangs_before_it_is_our_node_is_ended_and_started_again(ros2_nodes, monkeypatch):
+    """As rclpy may at a lock in shared memory that somebody who was killed has left."""
+    monkeypatch.setattr(native, "BEGIN_S", 2.0)
+    monkeypatch.setattr(native, "LEAVE_S", 0.2)
+    said = []
+    with RclpyNode(say=said.append) as node:
+        until(lambda: node.pid, "the program")
+        hung = node.pid
+        os.kill(hung, signal.SIGSTOP)
+        until(lambda: said, "a word on that")
+        monkeypatch.setattr(native, "BEGIN_S", 30.0)
+        until(lambda: len(said) == 2, "the node to be there")
+        assert not Path(f"/proc/{hung}").exists()
+    assert said == [
+        "the program that is our ROS 2 node did not answer for 2 s and was ended; it is started again",
+        "our ROS 2 node is there again",
+    ]
+
+
+def test_a_program_that_cannot_be_started_is_named_and_tried_again(ros2_nodes, tmp_path):
+    """As while a package is being upgraded, or no descriptor is left."""
+    python, away = tmp_path / "python", tmp_path / "away"
+    python.write_text(f'#!/bin/sh\nexec {ros2_nodes.python} "$@"\n')
+    python.chmod(0o755)
+    said = []
+    with RclpyNode(python=str(python), say=said.append) as node:
+        until(lambda: node.middleware, "the node")
+        python.rename(away)
+        os.kill(node.pid, signal.SIGKILL)
+        until(lambda: len(said) == 2, "a word on that")
+        away.rename(python)
+        until(lambda: node.middleware, "the node again")
+        assert not node.troubles
+    assert said == [
+        "the program that is our ROS 2 node ended by SIGKILL; it is started again",
+        f"the program that is our ROS 2 node cannot be started: [Errno 2] No such file or directory: '{python}'; "
+        "it is tried again",
+        "our ROS 2 node is there again",
+    ]
+
+
+def test_no_velocity_waits_for_a_program_that_has_just_been_started(ros2_nodes):
+    """Nor is the node called lost then, before it was there."""
+    with RclpyNode() as node:
+        wheels = node.publish(WHEELS, fresh_s=0.1)
+        until(lambda: node.pid, "the program")
+        while not node.middleware:
+            assert not wheels.stuck
+            assert not wheels.put(encode(Twist())) or node.middleware
+        until(lambda: wheels.put(encode(Twist())), "the node")
+
+
 def test_when_ros_is_shut_down_under_our_node_that_is_named_and_it_comes_back(ros2_nodes, monkeypatch, tmp_path):
     """The context is shut down from within, as a signal handler of a library's would."""
     (tmp_path / "sitecustomize.py").write_text(

@@ -73,8 +73,11 @@ class Handle:
         self._host.remove(self)
 
     def join(self, sender: Sender) -> None:
-        """The program runs: become part of the graph."""
+        """The program is started: become part of the graph."""
         self._sender = sender
+
+    def begin(self) -> None:
+        """The program is our node."""
 
     def leave(self) -> None:
         """The program is gone."""
@@ -118,6 +121,8 @@ class Publication(Handle):
         """When the program said for how long what was published is unread, and that [s]."""
         self._published = 0
         """Of those, as this program counts them."""
+        self._begun = False
+        """Whether the program is our node; what may not wait is not put before."""
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
@@ -126,8 +131,8 @@ class Publication(Handle):
         body = bytes(payload)
         if self.endpoint.qos.transient_local:
             self._kept = body
-        sender = self._sender
-        if sender is None or self.refused or self.stuck:
+        sender, early = self._sender, self._fresh_s < inf and not self._begun
+        if sender is None or early or self.refused or self.stuck:
             with self._lock:
                 self.dropped += 1
             return False
@@ -172,7 +177,11 @@ class Publication(Handle):
             self.passed += new
             self.dropped += waited - len(self._waiting) - new  # too old, or a newer one came before their turn
 
+    def begin(self) -> None:
+        self._begun = True
+
     def leave(self) -> None:
+        self._begun = False
         super().leave()
         self._forget()
 

@@ -32,6 +32,8 @@ from .side.outbox import Sender
 
 SILENT_S = 5.0
 """Without a sign of life of the program, which gives one each half second: then it hangs, and is ended."""
+BEGIN_S = 30.0
+"""For the program to be our node; on a small computer that has just been started it takes some seconds."""
 ALONE_S = 20.0
 """Without any other node in the graph: then that is said. ``--check`` waits for less."""
 NOBODY = (
@@ -99,7 +101,8 @@ class RclpyNode(NodeBase):
         """Of our node's logger: ``--log-level`` and the service ``set_logger_levels`` set it."""
         self._heard = 0
         """Frames of the program."""
-        self._hung = False
+        self._hung_s = 0.0
+        """For how long a program was silent that was ended for it [s]; 0: it ended by itself."""
 
     def _jobs(self) -> Sequence[Callable[[], None]]:
         return (self._run, self._see_that_it_answers)
@@ -173,6 +176,8 @@ class RclpyNode(NodeBase):
             self._handles[handle.channel] = handle
             if self._sender is not None:
                 handle.join(self._sender)
+                if self.middleware:
+                    handle.begin()
                 self._review(handle)
         return handle
 
@@ -180,34 +185,46 @@ class RclpyNode(NodeBase):
         """Thread of the node."""
         tried = 0
         while not self._closing.is_set():
-            ours, its = socket.socketpair()
-            with ours:
-                with its:
-                    program = subprocess.Popen(
-                        [self.python, str(_SIDE), str(its.fileno())],
-                        pass_fds=[its.fileno()],
-                        stdin=subprocess.DEVNULL,
-                        env=self._environment,
-                    )
-                self.pid = program.pid
-                try:
-                    self._keep(ours)
-                finally:
-                    self.pid = 0
-                    code = _end(program)
+            try:
+                key, why = "program", f"{self._why(self._be_one_program())}; it is started again"
+            except (OSError, RuntimeError) as error:  # no descriptor, memory or thread is left, or no Python is there
+                key, why = "start", f"cannot be started: {error}; it is tried again"
             if self._joined.is_set():
                 tried = 0
                 self._joined.clear()
             if not self._closing.is_set():
-                self.report("program", f"the program that is our ROS 2 node {self._why(code)}; it is started again")
+                self.report(key, f"the program that is our ROS 2 node {why}")
                 self._closing.wait(_RETRY_S[min(tried, len(_RETRY_S) - 1)])
                 tried += 1
 
+    def _be_one_program(self) -> int:
+        """Start the program and keep it until it ends; returns its exit code.
+
+        Raises:
+            OSError, RuntimeError: It cannot be started or kept.
+        """
+        ours, its = socket.socketpair()
+        with ours:
+            with its:
+                program = subprocess.Popen(
+                    [self.python, str(_SIDE), str(its.fileno())],
+                    pass_fds=[its.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=self._environment,
+                )
+            self.pid = program.pid
+            try:
+                self._keep(ours)
+            finally:
+                self.pid = 0
+                code = _end(program)
+        return code
+
     def _why(self, code: int) -> str:
         """How the program ended."""
-        hung, self._hung = self._hung, False
-        if hung:
-            return f"did not answer for {SILENT_S:g} s and was ended"
+        hung_s, self._hung_s = self._hung_s, 0.0
+        if hung_s:
+            return f"did not answer for {hung_s:g} s and was ended"
         if code == SHUT_DOWN:
             return "ended because ROS 2 was shut down in it"
         return f"ended by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
@@ -217,18 +234,20 @@ class RclpyNode(NodeBase):
 
         It counts its own turns, for this process may stand still, too.
         """
-        turn_s, heard, silent, alone = SILENT_S / 10, 0, 0, 0
+        turn_s, known, silent, alone = SILENT_S / 10, (0, 0), 0, 0
         while not self._closing.wait(turn_s):
-            silent = silent + 1 if self._heard == heard and self.middleware and self.pid else 0
-            heard = self._heard
+            seen = self._heard, self.pid
+            silent = silent + 1 if seen == known and self.pid else 0
+            known = seen
             alone = alone + 1 if self._joined.is_set() and not self.nodes else 0
             if alone * turn_s >= ALONE_S:
                 self.report("alone", f"ROS 2 graph ({self.middleware}, domain {self.domain}): {NOBODY}")
             elif self.nodes:
                 self.settle("alone")
             self._check_queues(time.monotonic())
-            if silent >= 10:
-                silent, self._hung = 0, True
+            limit_s = SILENT_S if self.middleware else BEGIN_S
+            if silent * turn_s >= limit_s:
+                silent, self._hung_s = 0, limit_s
                 with self._lock:
                     if self._link is not None:  # then it is ended by whoever started it
                         self._link.shutdown(socket.SHUT_RDWR)
@@ -269,7 +288,11 @@ class RclpyNode(NodeBase):
         match told["what"]:
             case "ready":
                 self.middleware, self.domain = told["rmw"], told["domain"]
+                with self._lock:
+                    for handle in self._handles.values():
+                        handle.begin()
                 self._troubles.settle("refused")
+                self._troubles.settle("start")
                 self._troubles.settle("program", "our ROS 2 node is there again")
             case "refused":
                 self.report("refused", f"ROS 2 does not let us be a node: {told['why']}; trying on")
