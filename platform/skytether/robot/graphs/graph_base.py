@@ -90,6 +90,7 @@ class GraphBase:
         send: Publishes a serialised velocity; must return at once.
         make: Turns the velocity into the message that the wheels take.
         idle_s: See `IDLE_S`; None: a standstill is told for ever.
+        heard: Whether the wheels hear what is sent; as long as they do not, a standstill is told again and again.
     """
 
     def __init__(
@@ -100,12 +101,14 @@ class GraphBase:
         *,
         make: Callable[[Twist], Message] = lambda twist: twist,
         idle_s: float | None = IDLE_S,
+        heard: Callable[[], bool] = lambda: True,
     ) -> None:
         self.topics: Mapping[str, type[Message]] = dict(readings)
         self._encoding = encoding
         self._send = send
         self._make = make
         self._idle_s = idle_s
+        self._heard = heard
         self._now = 0.0
         self._stood_since: float | None = None
         self._lock = threading.Lock()
@@ -141,7 +144,7 @@ class GraphBase:
             self._stood_since = None
         elif self._stood_since is None:
             self._stood_since = self._now
-        elif self._idle_s is not None and self._now - self._stood_since > self._idle_s:
+        elif self._idle_s is not None and self._now - self._stood_since > self._idle_s and self._heard():
             return
         self._send(encode(self._make(twist), self._encoding))
 

@@ -97,6 +97,7 @@ class Publication(Handle):
     """The newest message of a transient-local topic, for when there is a publisher."""
     stuck = False
     unread_s = 0.0
+    heard = True
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 

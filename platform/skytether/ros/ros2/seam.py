@@ -53,6 +53,14 @@ class Publication(Handle, Protocol):
         """For how long somebody who listens has not acknowledged what is published, where that is known [s]."""
         ...
 
+    @property
+    def heard(self) -> bool:
+        """Whether somebody listens, and is known to hear; true where that cannot be known.
+
+        A node that has just been found may miss the first messages for a second or two.
+        """
+        ...
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         ...

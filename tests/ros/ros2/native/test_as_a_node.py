@@ -2,12 +2,13 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
 from ros2_nodes import far_nodes, ros2_nodes, until
 
-from skytether.messages import Twist, TwistStamped, encode, hash_of
+from skytether.messages import Twist, TwistStamped, Vector3, encode, hash_of
 from skytether.robot.graphs.ros2.robot import Ros2Robot, Ros2RobotConfig
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.lifecycle import states
@@ -186,6 +187,37 @@ def test_no_velocity_waits_for_a_program_that_has_just_been_started(ros2_nodes):
             assert not wheels.stuck
             assert not wheels.put(encode(Twist())) or node.middleware
         until(lambda: wheels.put(encode(Twist())), "the node")
+
+
+def test_wheels_that_begin_to_listen_are_told_to_stand_first_and_hear_how_a_velocity_begins(ros2_nodes):
+    """As after the program has died: DDS takes a second or two, in which a ramp would be over."""
+    forward = Twist(linear=Vector3(x=0.5))
+    with RclpyNode() as node:
+        robot = Ros2Robot(Ros2RobotConfig("walker", "x", namespace="/"), node)
+        until(lambda: node.wait_until_joined(0.1), "our node")
+
+        def goes():
+            robot.base.read(time.monotonic())
+            try:
+                robot.base.write(forward)
+            except ConnectionError as error:
+                return str(error) != "the wheels are told to stand until their node listens and hears us"
+            return True
+
+        robot.base.write(Twist())
+        for _ in range(20):
+            assert not goes(), "nobody listens"
+            time.sleep(0.02)
+        peer = ros2_nodes.start(
+            """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+"""
+        )
+        until(goes, "the wheels to hear")
+        until(lambda: (goes() and peer.heard.extend(peer.all())) or 0.5 in peer.heard, "the velocity")
+        robot.close()
+    assert peer.heard[0] == 0.0
 
 
 def test_when_ros_is_shut_down_under_our_node_that_is_named_and_it_comes_back(ros2_nodes, monkeypatch, tmp_path):

@@ -85,8 +85,11 @@ class Ros2Robot(RosRobot):
         self._own: list[tuple[str, Handle]] = []
         """Readings and wheels, by the robot's names."""
         self._told = False
+        self._goes = False
+        """Whether the velocity that is to be sent is no standstill."""
         own = config.names(())
         send: Callable[[bytes], object] = nowhere
+        heard: Callable[[], bool] = _always
         if config.cmd_vel is not None:
             stand: Message = Twist() if config.cmd_vel_type == Twist.TYPE else TwistStamped()
             endpoint = self._endpoint(Kind.PUBLISHER, own.own(config.cmd_vel), config.cmd_vel_type)
@@ -94,17 +97,22 @@ class Ros2Robot(RosRobot):
             self._ends.append(wheels.close)
             self._own.append((config.cmd_vel, wheels))
 
+            def heard() -> bool:
+                return wheels.heard
+
             def send(velocity: bytes) -> None:
-                if wheels.put(velocity):
+                goes = self._goes and not wheels.heard  # who begins to hear is to hear how the velocity begins, too
+                if wheels.put(encode(self._make(Twist())) if goes else velocity):
                     self._told = True
+                    if goes:
+                        raise ConnectionError("the wheels are told to stand until their node listens and hears us")
                 elif self._told:  # then the loop goes on from standstill when they can be told again
                     raise ConnectionError(
                         wheels.refused or "the wheels cannot be told: our ROS 2 node is lost, or hangs"
                     )
 
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
-        make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is
-        self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s)
+        self.base = GraphBase(readings, self.encoding, send, make=self._noted, idle_s=config.idle_s, heard=heard)
         for name, cls in readings.items():
             endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
             reading = node.subscribe(endpoint, partial(self.base.put, name))
@@ -162,7 +170,13 @@ class Ros2Robot(RosRobot):
         if isinstance(self._clock, GraphClock):
             self._clock.close()
 
-    def _stamped(self, twist: Twist) -> TwistStamped:
+    def _noted(self, twist: Twist) -> Message:
+        self._goes = twist != Twist()
+        return self._make(twist)
+
+    def _make(self, twist: Twist) -> Message:
+        if self._config.cmd_vel_type == Twist.TYPE:
+            return twist
         return TwistStamped(Header(Time.from_seconds(self._clock()), self._config.frame), twist)
 
     def _types(self, names: Sequence[str]) -> dict[str, str]:
@@ -175,5 +189,5 @@ class Ros2Robot(RosRobot):
         return Endpoint(kind, name, type_name, hash_of(type_name, "cdr"), qos)
 
 
-def _as_it_is(twist: Twist) -> Message:
-    return twist
+def _always() -> bool:
+    return True

@@ -121,6 +121,7 @@ class Publication(Handle):
         """When the program said for how long what was published is unread, and that [s]."""
         self._published = 0
         """Of those, as this program counts them."""
+        self._heard = False
         self._begun = False
         """Whether the program is our node; what may not wait is not put before."""
         self._kept: bytes | None = None
@@ -160,6 +161,11 @@ class Publication(Handle):
             at, unread_s = self._unread
         return unread_s if 0 <= _now() - at <= _LATELY_S else 0.0
 
+    @property
+    def heard(self) -> bool:
+        """See `skytether.ros.ros2.seam.Publication.heard`; known once a message with `fresh_s` was published."""
+        return self._heard
+
     def _fresh(self, body: bytes) -> Frame:
         with self._lock:
             number, now = next(self._numbers), _now()
@@ -167,8 +173,9 @@ class Publication(Handle):
             return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
 
     def on_frame(self, frame: Frame) -> None:
-        number, unread_s, published = pull_dealt_with(frame.body)
+        number, unread_s, published, heard = pull_dealt_with(frame.body)
         with self._lock:
+            self._heard = heard
             self._unread = (_now(), unread_s)
             waited = len(self._waiting)
             while self._waiting and self._waiting[0][0] <= number:
@@ -192,6 +199,7 @@ class Publication(Handle):
             self._waiting.clear()
             self._unread = (0.0, 0.0)
             self._published = 0
+            self._heard = False
 
     def join(self, sender: Sender) -> None:
         self._forget()  # one may have been put in the moment of the end

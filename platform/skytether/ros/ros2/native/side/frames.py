@@ -8,8 +8,9 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, serialised message, which is published until then
-  or never; from the node the number, float64 seconds for which nobody has acknowledged what was published, and uint64
-  how many of this topic were published so far: this message, and those before it, wait no more.
+  or never; from the node the number, float64 seconds for which nobody has acknowledged what was published, uint64 how
+  many of this topic were published so far, and a bool, whether they are heard: this message, and those before it, wait
+  no more.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple, Protocol
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
 FRESH = struct.Struct("<Qd")
-_DEALT_WITH = struct.Struct("<QdQ")
+_DEALT_WITH = struct.Struct("<QdQ?")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
@@ -93,7 +94,7 @@ def pull_fresh(body: bytes) -> tuple[int, float, bytes]:
     return *FRESH.unpack_from(body), body[FRESH.size :]
 
 
-def dealt_with(channel: int, number: int, unread_s: float, published: int) -> Frame:
+def dealt_with(channel: int, number: int, unread_s: float, published: int, heard: bool) -> Frame:
     """A frame of the node: it is done with a message of `fresh`, and all before it.
 
     Args:
@@ -101,14 +102,15 @@ def dealt_with(channel: int, number: int, unread_s: float, published: int) -> Fr
         number: Of the message.
         unread_s: For how long all before it are unread [s].
         published: How many of this topic were, so far.
+        heard: Whether somebody listens, and everybody who does is known to hear, or has had the time to begin.
     """
-    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published))
+    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published, heard))
 
 
-def pull_dealt_with(body: bytes) -> tuple[int, float, int]:
-    """Number, seconds and how many were published, of `dealt_with`."""
-    number, unread_s, published = _DEALT_WITH.unpack(body)
-    return number, unread_s, published
+def pull_dealt_with(body: bytes) -> tuple[int, float, int, bool]:
+    """Number, seconds, how many were published, and whether they are heard, of `dealt_with`."""
+    number, unread_s, published, heard = _DEALT_WITH.unpack(body)
+    return number, unread_s, published, heard
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

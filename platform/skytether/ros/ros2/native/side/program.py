@@ -56,6 +56,8 @@ MAX_ASKED = 64
 """Calls of one service that wait for the agent; who comes then is not answered."""
 NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
+HEARS_S = 3.0
+"""For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
 FAREWELL_S = 0.3
 """For the last messages to reach who listens."""
 _AT_ONCE = Duration()
@@ -122,6 +124,10 @@ class Program:
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._read_at: dict[int, float] = {}
         """When all that was published had been acknowledged last, where it was at some time [s]."""
+        self._listened: dict[int, float] = {}
+        """Since when somebody listens to what was published [s]."""
+        self._heard: set[int] = set()
+        """What somebody listens to, and is known to hear."""
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -208,13 +214,17 @@ class Program:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
             number, until, body = pull_fresh(frame.body)
-            publisher, unread_s = self._publishers.get(frame.channel), 0.0
+            publisher, unread_s, heard = self._publishers.get(frame.channel), 0.0, False
             if publisher is not None:
                 unread_s = self._unread_s(frame.channel, publisher)
+                heard = frame.channel in self._heard
                 if _now() <= until:
                     publisher.publish(body)
                     self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
-            self._sender.put(dealt_with(frame.channel, number, unread_s, self._published.get(frame.channel, 0)))
+                    if publisher.get_subscription_count():
+                        self._listened.setdefault(frame.channel, _now())
+            published = self._published.get(frame.channel, 0)
+            self._sender.put(dealt_with(frame.channel, number, unread_s, published, heard))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -241,7 +251,13 @@ class Program:
             read = publisher.wait_for_all_acked(_AT_ONCE)
         except Exception:  # this middleware does not tell
             read = True
-        if read and publisher.get_subscription_count():
+        listened = publisher.get_subscription_count()
+        if not listened:
+            self._listened.pop(channel, None)
+            self._heard.discard(channel)
+        elif channel in self._listened and (read or now - self._listened[channel] > HEARS_S):
+            self._heard.add(channel)
+        if read and listened:
             self._read_at[channel] = now
         elif read:
             self._read_at.pop(channel, None)
@@ -315,6 +331,8 @@ class Program:
         self._names.pop(channel, None)
         self._farewells.pop(channel, None)
         self._read_at.pop(channel, None)
+        self._listened.pop(channel, None)
+        self._heard.discard(channel)
         server = self._servers.pop(channel, None)
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
