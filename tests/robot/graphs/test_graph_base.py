@@ -1,3 +1,5 @@
+import pytest
+
 from skytether.messages import String, Twist, Vector3, Wrench, WrenchStamped, decode, encode
 from skytether.robot.graphs.graph_base import GraphBase
 
@@ -44,6 +46,29 @@ def test_a_lasting_standstill_leaves_the_wheels_to_others_and_motion_takes_them_
     for tick in range(50):
         drive(base, 3.01 + tick / 100, 0.0)
     assert [decode(Twist, data, "ros1").linear.x for data in sent] == [0.2] + 50 * [0.0]
+
+
+def test_a_standstill_that_could_not_be_told_is_told_when_it_can_be():
+    """The wheels' last word would else be the velocity from before."""
+    sent, lost = [], [False]
+
+    def send(data):
+        if lost[0]:
+            raise ConnectionError("the node hangs")
+        sent.append(decode(Twist, data, "ros1").linear.x)
+
+    base = GraphBase({}, "ros1", send, idle_s=1.0)
+    drive(base, 0.0, 0.2)
+    lost[0] = True
+    for tick in range(300):
+        with pytest.raises(ConnectionError):
+            drive(base, 0.01 + tick / 100, 0.0)
+    lost[0] = False
+    for tick in range(300):
+        drive(base, 4.0 + tick / 100, 0.0)
+    assert sent[0] == 0.2
+    assert 99 <= len(sent[1:]) <= 102
+    assert not any(sent[1:])
 
 
 def test_a_standstill_is_told_for_ever_if_asked_to_and_the_message_is_the_graph_s_own():

@@ -146,7 +146,11 @@ class GraphBase:
             self._stood_since = self._now
         elif self._idle_s is not None and self._now - self._stood_since > self._idle_s and self._heard():
             return
-        self._send(encode(self._make(twist), self._encoding))
+        try:
+            self._send(encode(self._make(twist), self._encoding))
+        except Exception:
+            self._stood_since = None  # a standstill lasts from when the wheels were told of it
+            raise
 
 
 _STANDSTILL = Twist()
