@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import base64
 import contextlib
+import json
 import os
 import secrets
 import socket
@@ -457,3 +458,18 @@ def test_a_link_or_a_pipe_for_a_ready_file_is_none_and_holds_nobody_up(tmp_path:
     assert noted_port(tmp_path / "real") == 4000
     assert noted_port(tmp_path / "link") is None
     assert noted_port(tmp_path / "pipe") is None
+
+
+def test_a_program_that_the_service_does_not_see_is_named(tmp_path: Path) -> None:
+    asked: dict[str, Any] = {
+        "read": [],
+        "write": [],
+        "user": None,
+        "landlock": 0,
+        "seccomp": False,
+        "command": [str(tmp_path / "x")],
+    }
+    done = subprocess.run([sys.executable, confine.__file__, json.dumps(asked)], capture_output=True, text=True)
+    assert done.returncode == 1
+    said = f"the service cannot be confined: [Errno 2] {tmp_path}/x: No such file or directory; the service does not"
+    assert done.stderr.startswith(said)

@@ -339,7 +339,11 @@ def main() -> None:
         landlock(asked["landlock"], read, write)
     if asked["seccomp"]:
         seccomp(asked["families"], owner=user is None, empties=user is None and asked["landlock"] < HOLDS_TRUNCATE)
-    os.execv(asked["command"][0], asked["command"])  # noqa: S606 (no shell is wanted)
+    program = asked["command"][0]
+    try:
+        os.execv(program, asked["command"])  # noqa: S606 (no shell is wanted)
+    except OSError as error:  # it does not name it; often a link that leads through a folder that is covered
+        raise OSError(error.errno, f"{program}: {error.strerror}; the service does not see it") from error
 
 
 if __name__ == "__main__":
