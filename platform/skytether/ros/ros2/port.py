@@ -11,11 +11,12 @@ from collections import deque
 from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import inf
 from typing import Protocol, runtime_checkable
 
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
-from skytether.messages import Encoding, definition_of, hash_of
+from skytether.messages import Encoding, Twist, TwistStamped, definition_of, hash_of
 from skytether.ros import notes as graph_notes
 from skytether.ros.followed import Followed
 from skytether.ros.names import bridge_type
@@ -38,6 +39,8 @@ SURVEY_S = 0.5
 _EARLY = 16
 """Messages kept of a topic whose type the peer has not told yet."""
 _RIHS = "RIHS01_"
+_VELOCITIES = {Twist.TYPE, TwistStamped.TYPE}
+"""Late, they are worse than none: whoever has them drives on."""
 
 
 @runtime_checkable
@@ -217,7 +220,8 @@ class Ros2Port:
         if endpoint.kind is Kind.PUBLISHER:
             if self._may(Access.PUBLISH, row.name, endpoint.name):
                 every = row.reliable or row.depth > 1  # not only the newest
-                way.handle = way.publication = self._node.publish(endpoint, waits=every)
+                fresh_s = row.lifespan if endpoint.type in _VELOCITIES and not every else inf
+                way.handle = way.publication = self._node.publish(endpoint, waits=every, fresh_s=fresh_s)
         else:
             send, lose = partial(self._send, row.name), partial(self._lose, row.name)
             if endpoint.name == STATIC_TF:

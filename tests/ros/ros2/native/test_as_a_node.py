@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,8 @@ def test_stamps_are_of_simulated_time_if_our_node_uses_it(ros2_nodes):
 
         def stamps():
             robot.base.read(0.0)
-            robot.base.write(Twist())
+            with suppress(ConnectionError):  # on a busy machine the node may seem to hang for a moment
+                robot.base.write(Twist())
             return peer.all()
 
         until(lambda: [0, 0] in stamps(), "a stamp before there is a clock")

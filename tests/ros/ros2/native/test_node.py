@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from unittest.mock import Mock
 
 import pytest
 from ros2_nodes import ros2_nodes, until
@@ -14,7 +15,10 @@ from skytether.messages import Twist, Vector3, decode, encode, hash_of
 from skytether.ros.ros2 import graph
 from skytether.ros.ros2.dialect import Endpoint, Kind, NodeName
 from skytether.ros.ros2.native.node import RclpyNode
+from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
+from skytether.wire.events import MessageReceived
+from skytether.wire.topic import Direction, Role, Topic
 
 __all__ = ["ros2_nodes"]
 pytestmark = [pytest.mark.slow, pytest.mark.ros2]
@@ -303,6 +307,33 @@ node.create_subscription(Twist, "/bot/cmd_vel", lambda m: say(m.linear.x), 100)
     assert wheels.passed == before + 1
 
 
+def test_a_bridge_s_velocity_that_waited_in_a_program_that_hung_is_not_published(ros2_nodes, ours):
+    """Its topic's lifespan is over; nobody may say anything after it, and the wheels would drive on."""
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 100)
+"""
+    )
+    row = Topic("cmd_vel", TWIST, Direction.OUT)
+    port = Ros2Port(ours, [row], Role.ROBOT)
+    port.attach(Mock())
+    (way,) = [handle for handle in ours._handles.values() if handle.endpoint.name == "/cmd_vel"]
+
+    def deliver(speed):
+        port.deliver(MessageReceived(row.name, encode(Twist(linear=Vector3(x=speed))), 0, 0.0, 0.0, 0.0))
+
+    until(lambda: deliver(0.5) or peer.all(), "the first velocity")
+    os.kill(ours.pid, signal.SIGSTOP)
+    until(lambda: deliver(2.5) or way.stuck, "the program to be stuck")
+    peer.all()
+    os.kill(ours.pid, signal.SIGCONT)
+    until(lambda: not way.stuck, "the program to go on")
+    until(lambda: deliver(0.0) or peer.heard.extend(peer.all()) or 0.0 in peer.heard, "a velocity again")
+    assert 2.5 not in peer.heard
+    port.close()
+
+
 def test_there_is_a_node_where_no_log_can_be_written(ros2_nodes, monkeypatch):
     """As below systemd's ProtectHome; ROS 2 has its log files below the home folder."""
     for name in ("ROS_LOG_DIR", "ROS_HOME"):
@@ -339,7 +370,10 @@ from skytether.messages import Twist, Vector3, encode, hash_of
 from skytether.ros.ros2 import graph
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.native.node import RclpyNode
+from skytether.ros.ros2.port import Ros2Port
 from skytether.ros.ros2.qos import Qos
+from skytether.wire.events import MessageReceived
+from skytether.wire.topic import Direction, Role, Topic
 with RclpyNode() as node:
     hashed = hash_of("{TWIST}", "cdr")
     node.subscribe(Endpoint(Kind.SUBSCRIPTION, "/odom", "{TWIST}", hashed, Qos(depth=10)), lambda _: None)
