@@ -47,6 +47,8 @@ class Engine:
         self.container: dict[str, Any] = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": []}
         self.links: set[str] = set()
         """In its images."""
+        self.large: set[str] = set()
+        """In its images."""
         self.pipes: set[str] = set()
         """In its images."""
         self.volumes: list[dict[str, Any]] = []
@@ -88,7 +90,10 @@ class Engine:
                     text = engine.file
                 self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
-                stat = {"mode": 1 << 27 if asked in engine.links else 1 << 25 if asked in engine.pipes else 0o644}
+                stat = {
+                    "mode": 1 << 27 if asked in engine.links else 1 << 25 if asked in engine.pipes else 0o644,
+                    "size": 1 << 30 if asked in engine.large else 1000,
+                }
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
                 self.send_header("Content-Length", str(len(text)))
                 self.end_headers()
@@ -362,6 +367,10 @@ def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Eng
         ([volume("/d", "skytether-d")], {}, b"200 OK"),
         ([volume("/dev", "skytether-d")], {}, b"/dev is the kernel's"),
         ([volume("/sys/fs")], {}, b"/sys/fs is the kernel's"),
+        ([volume("dev")], {}, b"dev is no whole path"),
+        ([volume("/d", "skytether-d"), volume("d/x")], {}, b"d/x is no whole path"),
+        ([volume(".")], {}, b". is no whole path"),
+        ([volume("/d/../dev")], {}, b"/d/../dev is no whole path"),
         ([volume("/d", "skytether-d")], {"Tmpfs": {"/dev//x": ""}}, b"/dev/x is the kernel's"),
         ([volume("/d", "skytether-d")], {"Tmpfs": {"/d/x/": ""}}, b"/d/x is in /d, where things can be moved"),
         ([volume("/d", "skytether-d")], {"Tmpfs": {"/lib/x": ""}}, b"/lib is a link in its image"),
@@ -372,13 +381,18 @@ def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Eng
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "/etc/group"])
 def test_no_engine_waits_for_ever_for_what_an_image_says_of_users(engine: Engine, path: str) -> None:
-    """It reads that as it starts a container, which nobody ends then: of a pipe it waits, of a device it takes all."""
+    """It reads that as it starts a container, which nobody ends then: of a pipe it waits, of a device it takes all.
+
+    Of a file it keeps each line that fits, in its own memory.
+    """
     engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
     engine.container = {"HostConfig": {"NetworkMode": "skytether", "ReadonlyRootfs": True}}
     start = request(f"POST /v1.41/containers/{ID}/start")
     engine.pipes = {path, "/run/pipe"}
     assert f"{path} is a link in its image, or no file".encode() in say(engine, start)
-    engine.pipes = {"/run"}
+    engine.pipes, engine.large = set(), {path}
+    assert f"{path} is a link in its image, or no file, or a large one".encode() in say(engine, start)
+    engine.pipes, engine.large = {"/run"}, {"/lib"}
     assert b"200 OK" in say(engine, start)
 
 

@@ -36,7 +36,10 @@ _STAT = "x-docker-container-path-stat"
 _LINK, _NO_FILE = 1 << 27, 1 << 19
 """Go's bits in a file's mode: of a link, and the lowest of those that say that it is none."""
 _USERS = {"/etc/passwd", "/etc/group"}
-"""An engine reads them as it starts a container: of a pipe it waits for ever, of a device it takes all that comes."""
+"""An engine reads them as it starts a container: of a pipe it waits for ever, of a device it takes all that comes, and
+of a file it keeps each line that fits."""
+_MOST_USERS = 1 << 20
+"""Bytes in one of these."""
 _KNOWN = 4096
 _BLOCK = 512
 _FOLDERS, _GRANT = re.compile(r"instance|data(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80})?"), "instance/grant.json"
@@ -89,6 +92,9 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
         return "it may change its own files"
     mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
     for path in (*mounts, *_FILES, *_in_memory(inspected)):
+        if not path.startswith("/") or posixpath.normpath(path) != path:
+            # Of a volume that an image names so: what it is in or at is said by no comparison here.
+            return f"{path or 'nothing'} is no whole path"
         if _KERNEL.fullmatch(path):
             return f"{path} is the kernel's"
         for above, mount in mounts.items():
@@ -173,6 +179,7 @@ class Images:
             return False
         if answer.status != HTTPStatus.OK:
             raise ValueError(f"its engine says {answer.status} to {path}")
-        return bool(
-            json.loads(base64.b64decode(answer.headers[_STAT]))["mode"] & (_LINK if path not in _USERS else -_NO_FILE)
-        )
+        stat = json.loads(base64.b64decode(answer.headers[_STAT]))
+        if path in _USERS:
+            return bool(stat["mode"] & -_NO_FILE) or stat["size"] > _MOST_USERS
+        return bool(stat["mode"] & _LINK)

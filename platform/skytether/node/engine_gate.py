@@ -222,7 +222,7 @@ class EngineGate:
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if odd:
-            raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file")
+            raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file, or a large one")
         self._opened = self._opened if len(self._opened) < _KNOWN else set()
         self._opened.add(container)
 
