@@ -11,7 +11,7 @@ from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.node.archives import cleaned
 from skytether.node.engine_rules import Call, judge
-from skytether.node.seccomp_rules import holds
+from skytether.node.seccomp_rules import holds, keeps_in
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker.objects import (
     READY,
@@ -29,6 +29,7 @@ from skytether.orchestrator.runtimes.docker.options import DockerOptions
 OWNER = {"skytether.io/owner": "edge"}
 SECURITY = ["no-new-privileges", 'seccomp={"defaultAction": "SCMP_ACT_ERRNO"}']
 ID = "f" * 64
+JOINED = DockerOptions(engine="node://edge", advertise_host="192.0.2.1", seccomp="default")
 
 
 def asked(method: str, path: str, body: Any = None, devices: tuple[str, ...] = (), /, **query: str) -> str | None:
@@ -65,6 +66,7 @@ def service(options: DockerOptions, namespace: Namespace | None = None, **needs:
         service(DockerOptions(seccomp=None, gpu=2), gpu=2),
         service(DockerOptions(devices=("/dev/video0",), groups=(44,)), devices=["/dev/video0"]),
         guard(DockerOptions(), "edge", "sha256:" + "a" * 64, ID, "add table inet skytether"),
+        guard(JOINED, "edge", "sha256:" + "a" * 64, ID, ""),
         holder(DockerOptions(), "edge", "sha256:" + "a" * 64),
     ],
 )
@@ -190,6 +192,10 @@ HOST: dict[str, Any] = {
         ({"CapDrop": []}, "it keeps rights of root"),
         ({"CapAdd": ["SYS_ADMIN"]}, "it has the rights ['SYS_ADMIN']"),
         ({"CapAdd": ["NET_ADMIN"]}, "it has the rights ['NET_ADMIN']"),
+        (
+            {"CapAdd": ["NET_ADMIN"], "NetworkMode": f"container:{ID}", "SecurityOpt": SECURITY[:1]},
+            "its right ends at its own network",
+        ),
         ({"CapAdd": ["NET_ADMIN", "SYS_ADMIN"], "NetworkMode": f"container:{ID}"}, "it has the rights"),
         ({"SecurityOpt": []}, "lets go of what holds it"),
         ({"SecurityOpt": [*SECURITY[:1], "seccomp=unconfined"]}, "lets go of what holds it"),
@@ -312,6 +318,7 @@ def test_nothing_else_is_passed_on(method: str, path: str, body: Any, query: dic
 def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are() -> None:
     mounts = [named(NoCopy=True)]
     held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": mounts}
+    held["SecurityOpt"] = SECURITY
     made = {"Image": "a", "Labels": OWNER, "HostConfig": held}
     assert judge(Call("POST", "/containers/create", {}, made)) == (
         None,
@@ -391,6 +398,44 @@ NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ
 )
 def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: bool) -> None:
     assert holds(json.dumps({"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [entry]})) is good
+
+
+def made_by(*values: int, **more: Any) -> dict[str, Any]:
+    """Sockets with these arguments, the second of which is free."""
+    args = [{"index": 2 * at, "value": value, "op": "SCMP_CMP_EQ", **more} for at, value in enumerate(values)]
+    return allowed("socket", args=args)
+
+
+@pytest.mark.parametrize(
+    ("entry", "good"),
+    [
+        (allowed("read", "socketpair"), True),
+        *((made_by(family), True) for family in (1, 2, 10)),
+        (made_by(16, 12), True),
+        ({"names": ["socketcall", "socket"], "action": "SCMP_ACT_ERRNO"}, True),
+        (made_by(16, 0), False),
+        (made_by(16, 16), False),
+        (made_by(16), False),
+        (made_by(17), False),
+        (made_by(16, 12, op="SCMP_CMP_NE"), False),
+        (allowed("socket"), False),
+        (allowed("read", "socket", args=[]), False),
+        (allowed("socketcall"), False),  # its arguments are in memory
+        ({"name": "socket", "action": "SCMP_ACT_ALLOW"}, False),
+        ({**made_by(16, 0), "action": "SCMP_ACT_LOG"}, False),
+    ],
+)
+def test_by_the_profile_of_a_guard_nobody_asks_the_kernel_for_links_of_the_machine(
+    entry: dict[str, Any], good: bool
+) -> None:
+    """Its right is one over every network that a socket for routes can name, and it names the machine's by a number."""
+    profile = {"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [entry]}
+    assert keeps_in(json.dumps(profile)) is good
+    native = {"architecture": "SCMP_ARCH_X86_64"}
+    assert keeps_in(json.dumps({**profile, "archMap": [{**native, "subArchitectures": []}]})) is good
+    assert not keeps_in(json.dumps({**profile, "archMap": [{**native, "subArchitectures": ["SCMP_ARCH_X86"]}]}))
+    assert not keeps_in(json.dumps({**profile, "archMap": [{**native, "SubArchitectures": ["SCMP_ARCH_X86"]}]}))
+    assert not keeps_in(json.dumps({**profile, "architectures": ["SCMP_ARCH_X86_64", "SCMP_ARCH_X86"]}))
 
 
 @pytest.mark.parametrize(

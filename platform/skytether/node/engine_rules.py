@@ -17,7 +17,7 @@ from typing import Any
 
 from skytether.api.service_report import FILE_NAME
 
-from .seccomp_rules import holds, once
+from .seccomp_rules import holds, keeps_in, once
 
 OWNER, NETWORK, OLD_GUARD = "skytether.io/owner", "skytether.io/network", "skytether.io/guard"
 """Labels of what orchestrators made."""
@@ -247,7 +247,7 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         None if type(pids) is int and 0 < pids <= _MOST_PIDS else f"its PidsLimit is {str(pids)[:80]}",
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
         _rights(host.get("CapAdd") or [], mode),
-        _security(host.get("SecurityOpt")),
+        _security(host.get("SecurityOpt"), guards=bool(host.get("CapAdd"))),
         None if host.get("CgroupParent", "/") == "/" else "it is to be in a group of other processes",
         None if host.get("IpcMode", "none") in ("none", "private") else "it shares memory with others",
         # Without a type, an engine gives what is set here to its own kind of log, which may be one that goes elsewhere.
@@ -268,11 +268,13 @@ def _rights(added: Any, mode: str) -> str | None:
     return f"it has the rights {str(added)[:80]}"
 
 
-def _security(options: Any) -> str | None:
+def _security(options: Any, *, guards: bool) -> str | None:
     given = options if isinstance(options, list) else []
     profiles = [str(one) for one in given if one != "no-new-privileges"]
     if len(profiles) == len(given) or not all(p.startswith("seccomp=") and holds(p[8:]) for p in profiles):
         return "its SecurityOpt lets go of what holds it"
+    if guards and not (profiles and all(keeps_in(profile[8:]) for profile in profiles)):
+        return "a guard has a seccomp profile by which its right ends at its own network"
     return None
 
 

@@ -41,6 +41,9 @@ _FLAGS_SECOND = {"s390", "s390x"}
 """Where they are its second argument."""
 _GUARDS = {"CAP_NET_ADMIN"}
 """What a container may have of rights: an entry for others of them never applies."""
+_ONE_FAMILY = tuple([{"index": 0, "value": family, "op": "SCMP_CMP_EQ"}] for family in (1, 2, 10))
+_OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "value": 12, "op": "SCMP_CMP_EQ"}]
+"""Arguments of sockets: of AF_UNIX, AF_INET and AF_INET6; and of AF_NETLINK that for netfilter."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
 
@@ -55,6 +58,33 @@ def holds(text: str) -> bool:
         return False
     entries = profile.get("syscalls") or []
     return isinstance(entries, list) and all(isinstance(one, dict) and _closed(one) for one in entries)
+
+
+def keeps_in(text: str) -> bool:
+    """Whether by a profile that holds the right of a guard is one over its own network alone.
+
+    A container is root of the machine's own user namespace, and so its right is one over all networks, where it can
+    name them. A socket for routes names another one by a number, and there is one for the machine's: the other end of
+    the container's link is there. By it a container sees, makes, moves and ends links of the machine.
+    """
+    profile = json.loads(text)
+    maps = profile.get("archMap") or []
+    # In 32 bits sockets are made by what a filter does not see into.
+    if profile.get("architectures") or not isinstance(maps, list) or not all(map(_is_alone, maps)):
+        return False
+    return all(_makes_few(one) for one in profile.get("syscalls") or [])
+
+
+def _is_alone(arches: Any) -> bool:
+    known = isinstance(arches, dict) and not arches.keys() - {"architecture", "subArchitectures"}
+    return known and not arches.get("subArchitectures")
+
+
+def _makes_few(entry: Mapping[str, Any]) -> bool:
+    names = [*(entry.get("names") or []), entry.get("name")]
+    if entry.get("action") in _REFUSES or not ("socket" in names or "socketcall" in names):
+        return True
+    return "socketcall" not in names and (entry.get("args") == _OF_FILTERS or entry.get("args") in _ONE_FAMILY)
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

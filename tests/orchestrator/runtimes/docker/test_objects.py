@@ -24,6 +24,8 @@ from pydantic import ValidationError
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.api.pull_progress import PullProgress
+from skytether.node.seccomp_rules import holds as holds_all
+from skytether.node.seccomp_rules import keeps_in
 from skytether.orchestrator.runtimes.base import Launch, OvertakenError, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.containers import last_line
 from skytether.orchestrator.runtimes.docker import DockerRuntime
@@ -370,9 +372,11 @@ def test_who_holds_a_network_has_no_right_and_a_guard_one_in_one_network() -> No
     assert holds["User"] == "65532:65532"
     assert guards["HostConfig"]["CapAdd"] == ["NET_ADMIN"]
     assert guards["HostConfig"]["NetworkMode"] == "container:c1"
+    assert holds["HostConfig"]["SecurityOpt"] == options().security
+    assert guards["HostConfig"]["SecurityOpt"] == options().guard_security
     for host in (holds["HostConfig"], guards["HostConfig"]):
         assert (host["CapDrop"], host["ReadonlyRootfs"], host["IpcMode"]) == (["ALL"], True, "none")
-        assert host["SecurityOpt"] == options().security
+        assert host["SecurityOpt"][0] == "no-new-privileges"
         assert not host.keys() & {"Privileged", "Binds", "Mounts", "PidMode"}
     assert "CapAdd" not in holds["HostConfig"]
     for made, target in ((holds, ""), (guards, "c1")):
@@ -505,10 +509,15 @@ def test_the_profile_of_calls_is_an_allow_list_and_another_may_be_named(tmp_path
     forbidden = {"ptrace", "process_vm_readv", "mount", "unshare", "setns", "bpf", "keyctl", "io_uring_setup", "chroot"}
     assert not allowed & (forbidden | {"clone3", "userfaultfd", "perf_event_open", "open_by_handle_at", "personality"})
     assert {row["args"][0]["value"] for row in profile["syscalls"] if row["names"] == ["socket"]} == {1, 2, 10, 16}
-    assert options(seccomp="default").security == ["no-new-privileges"]
+    assert options(seccomp="default").security == options(seccomp="default").guard_security == ["no-new-privileges"]
     (tmp_path / "own.json").write_text('{"defaultAction": "SCMP_ACT_ALLOW"}')
     own = options(seccomp=str(tmp_path / "own.json")).security
     assert own == ["no-new-privileges", 'seccomp={"defaultAction": "SCMP_ACT_ALLOW"}']
+    of_guards = options(seccomp=str(tmp_path / "own.json")).guard_security
+    assert of_guards == options(seccomp="default", engine="node://edge", advertise_host="192.0.2.1").guard_security
+    (profile,) = (row[8:] for row in of_guards if row.startswith("seccomp="))
+    assert holds_all(profile)
+    assert keeps_in(profile)
     with pytest.raises(RuntimeFailure, match="seccomp /nowhere"):
         DockerRuntime("edge", tmp_path, options(seccomp="/nowhere"))
 

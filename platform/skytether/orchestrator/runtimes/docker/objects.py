@@ -291,7 +291,7 @@ def guard(options: DockerOptions, owner: str, image: str, target: str, script: s
             **_HELPS,
             "CapDrop": ["ALL"],
             "CapAdd": ["NET_ADMIN"],
-            "SecurityOpt": options.security,
+            "SecurityOpt": options.guard_security,
         },
         "Labels": {OWNER: owner, HELPER: target, **_MANAGED},
     }

@@ -24,6 +24,7 @@ _NO_NETWORKS = ("host", "none", "default")
 
 _PLAIN = frozenset(ascii_letters + digits + "._:-")
 """Characters of a host and of a user; the colon is an IPv6 address's."""
+_AF_NETLINK, _NETLINK_NETFILTER = 16, 12
 _OURS = str(Path(__file__).with_name("seccomp.json"))
 
 
@@ -33,6 +34,16 @@ def _profile(path: str) -> str:
         return json.dumps(json.loads(Path(path).read_bytes()))
     except (OSError, ValueError) as error:
         raise RuntimeFailure(f"seccomp {path}: {error}") from error
+
+
+@functools.cache
+def _guards_profile() -> str:
+    """Ours, and of sockets to the kernel that for netfilter alone: see `skytether.node.seccomp_rules.keeps_in`."""
+    profile = json.loads(_profile(_OURS))
+    for entry in profile["syscalls"]:
+        if entry["names"] == ["socket"] and entry["args"][0]["value"] == _AF_NETLINK:
+            entry["args"].append({"index": 2, "value": _NETLINK_NETFILTER, "op": "SCMP_CMP_EQ"})
+    return json.dumps(profile)
 
 
 class TlsOptions(Strict):
@@ -130,6 +141,12 @@ class DockerOptions(Strict):
         """
         own = ["no-new-privileges"]
         return own if self.seccomp == "default" else [*own, f"seccomp={_profile(self.seccomp or _OURS)}"]
+
+    @property
+    def guard_security(self) -> list[str]:
+        """The same for a guard, which has a right to its network: by a socket for routes it were one to all of them."""
+        closed = self.seccomp != "default" or self.address.scheme == "node"  # an engine may have no seccomp at all
+        return ["no-new-privileges", f"seccomp={_guards_profile()}"] if closed else self.security
 
     @property
     def address(self) -> SplitResult:
