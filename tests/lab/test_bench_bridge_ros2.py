@@ -9,12 +9,12 @@ import pytest
 from skytether.lab.bench import conditions
 from skytether.lab.bench.bridge import make_plan
 from skytether.lab.bench.pair import BenchError, Pair
-from skytether.lab.bench.ros2_node import PYTHON
 from skytether.lab.bench.traffic import CAMERA, COMMANDS
 from skytether.lab.bench.transports import EndSpec, TransportError, load
 from skytether.lab.bench.transports import ros2 as transport
 from skytether.lab.bench.transports.ros2 import TunedReliable
 from skytether.lab.bench.transports.ros2_settings import fastdds_profile
+from skytether.lab.ros2_python import PYTHON
 from skytether.wire.topic import Role
 
 FLOWS = (*COMMANDS, CAMERA)

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from skytether.cli.commands.lab.app import app as cli
 from skytether.lab.bench.ros import BRIDGED, MESSAGES, PLAIN, _row, _Seen, bench_ros
-from skytether.lab.bench.ros2_node import PYTHON
+from skytether.lab.ros2_python import PYTHON
 
 
 @pytest.mark.slow

@@ -16,12 +16,13 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from skytether.lab.granted import Granted
 from skytether.robot.agent.agent import Agent
 from skytether.robot.control.arbiter import Reason
 from skytether.robot.control.command import Command, Source
 from skytether.robot.control.control_status import ControlStatus
 
-from .failover import LEARN_S, Granted, Wheels, bench_config, start_link, start_service, wait_for
+from .failover import LEARN_S, Wheels, bench_config, start_link, start_service, wait_for
 
 _MOST_GAPS = 1_000_000
 """An hour at 200 Hz, and some."""

@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple
@@ -31,6 +30,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
 from skytether.emulator.udp_link import LinkConditions, LinkEmulator
+from skytether.lab.granted import Granted
 from skytether.messages import Message, Twist, Vector3, Wrench, WrenchStamped, encode
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig
@@ -107,38 +107,6 @@ class Wheels:
 
     def write(self, twist: Twist) -> None:
         self.written.append(_Written(time.monotonic(), twist.linear.x, self.source()))
-
-
-class Granted:
-    """An orchestrator that gives the one session there is."""
-
-    def __init__(self, session: rest.Session) -> None:
-        now = datetime.now(UTC)
-        self._instance = rest.Instance(
-            id="bench",
-            robot="bench",
-            service="bench",
-            state=rest.State.RUNNING,
-            session=session,
-            created_at=now,
-            updated_at=now,
-            lease_expires_at=now,
-        )
-
-    def create_instance(self, *_: object, **__: object) -> rest.Instance:
-        return self._instance
-
-    def get_instance(self, *_: object) -> rest.Instance:
-        return self._instance
-
-    def renew_instance(self, *_: object) -> rest.Instance:
-        return self._instance
-
-    def claim_session(self, *_: object) -> str:
-        raise AssertionError("the session has its key")
-
-    def delete_instance(self, *_: object) -> object:
-        return self._instance
 
 
 def bench_failover(

@@ -21,8 +21,10 @@ from typing import Any
 
 import psutil
 
+from skytether.lab.ros2_python import ros2_python
+
 from .pair import LOOPBACK, BenchError, free_port
-from .ros2_node import Node, check_python, ros2_python
+from .ros2_node import Node, check_python
 from .ros2_program.schedule import Order
 from .rows import percentiles_ms
 from .traffic import Flow

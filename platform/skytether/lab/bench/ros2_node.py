@@ -13,23 +13,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from skytether.lab.ros2_python import PYTHON, ros2_python
+
 from . import ros2_program
 from .ros2_program.schedule import Order
 from .rows import Notes
 from .transports.base import TransportError
 
-PYTHON = "SKYTETHER_ROS2_PYTHON"
-"""Names ROS 2's Python."""
 _START = "import runpy, sys; sys.path.append(sys.argv[1]); runpy.run_module(sys.argv[2], run_name='__main__')"
 _STOP_S = 0.5
 _OVERRULED = ("ROS_LOCALHOST_ONLY", "ROS_SECURITY_ENABLE", "FASTRTPS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI")
 """What the user's environment may say, and a measurement decides."""
-
-
-def ros2_python() -> str:
-    """ROS 2's Python: the one that is named, else that of `make ros2`, else ``python3`` of a sourced ROS 2."""
-    made = Path(".venv-ros2/bin/python")
-    return os.environ.get(PYTHON) or (str(made.absolute()) if made.exists() else "python3")
 
 
 def check_python(module: str = "rclpy") -> None:

@@ -1,5 +1,5 @@
 """A robot whose hardware is played, around the real guard, gate and agent, and a judge of what its wheels were told.
 
 `robot` has the sockets and processes, `record` remembers what the wheels received, `checker` holds it against what is
-promised. Attacks are in `skytether.lab.bench.safety` and its neighbours; nothing here knows of them.
+promised. `attacks` and its neighbours hold the attacks; `skytether.lab.bench.safety` makes a benchmark of them.
 """

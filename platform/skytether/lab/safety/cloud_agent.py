@@ -18,7 +18,7 @@ from skytether.api import rest
 from skytether.api.manifest import Needs, TopicSpec
 from skytether.bridge import Bridge, SessionSpec
 from skytether.bridge.local import GraphPort, LocalGraph
-from skytether.lab.bench.failover import Granted
+from skytether.lab.granted import Granted
 from skytether.messages import Message, Twist, Vector3, encode
 from skytether.robot.agent.agent import Agent
 from skytether.robot.agent.config import AgentConfig

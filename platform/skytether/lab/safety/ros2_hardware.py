@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from skytether.guard.velocity import Velocity
-from skytether.lab.bench.ros2_node import ros2_python
+from skytether.lab.ros2_python import ros2_python
 from skytether.messages import Message, Twist, TwistStamped, encode
 
 from . import ros2_program
