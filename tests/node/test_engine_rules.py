@@ -10,7 +10,7 @@ import pytest
 from skytether.api.grant import Grant
 from skytether.api.manifest import ServiceSpec
 from skytether.node.archives import cleaned
-from skytether.node.engine_rules import Call, judge
+from skytether.node.engine_rules import LOOK, Call, judge
 from skytether.node.seccomp_rules import holds, keeps_in
 from skytether.orchestrator.runtimes.base import Launch
 from skytether.orchestrator.runtimes.docker.objects import (
@@ -349,6 +349,13 @@ def test_nothing_is_made_by_a_name_that_somebody_else_has_or_looks_for(name: str
     for odd in ("skt-", "skt-+", "skt-a/b", "skt-0123456789ab", "br0", None):
         changed = {**network, "Name": "skytether", "Options": {"com.docker.network.bridge.name": odd}}
         assert "a bridge of its own" in str(asked("POST", "/networks/create", changed))
+
+
+def test_no_orchestrator_takes_the_name_of_what_the_node_makes_itself() -> None:
+    """One that no engine ends would be in the way of every look at an image."""
+    made = {"Image": "a", "Labels": OWNER, "HostConfig": HOST}
+    assert "as what the node makes itself" in str(asked("POST", "/containers/create", made, name=f"{LOOK}0123abcd"))
+    assert asked("POST", "/containers/create", made, name=f"{LOOK}0123abcd-i1-1") is None
 
 
 @pytest.mark.parametrize("name", ["abc", "0123456789ab", ID[:63], "skytether-a"])

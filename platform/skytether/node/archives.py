@@ -24,7 +24,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from .engine_rules import NOBODY, OWNER
+from .engine_rules import LOOK, NOBODY, OWNER
 from .machine import ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
@@ -123,7 +123,7 @@ class Images:
     def __init__(self, engine: str) -> None:
         """``engine``: path of its socket."""
         self._engine = engine
-        self._name = f"skytether-look-{secrets.token_hex(4)}"
+        self._name = f"{LOOK}{secrets.token_hex(4)}"
         self._known: dict[tuple[str, str], bool] = {}
 
     def odd(self, image: str, paths: Iterable[str]) -> str | None:
