@@ -371,6 +371,7 @@ def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Eng
         ([volume("dev")], {}, b"dev is no whole path"),
         ([volume("/d", "skytether-d"), volume("d/x")], {}, b"d/x is no whole path"),
         ([volume(".")], {}, b". is no whole path"),
+        ([volume("//dev")], {}, b"//dev is no whole path"),
         ([volume("/d/../dev")], {}, b"/d/../dev is no whole path"),
         ([volume("/d", "skytether-d")], {"Tmpfs": {"/dev//x": ""}}, b"/dev/x is the kernel's"),
         ([volume("/d", "skytether-d")], {"Tmpfs": {"/d/x/": ""}}, b"/d/x is in /d, where things can be moved"),

@@ -92,7 +92,7 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
         return "it may change its own files"
     mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
     for path in (*mounts, *_FILES, *_in_memory(inspected)):
-        if not path.startswith("/") or posixpath.normpath(path) != path:
+        if path != "/" + posixpath.normpath(path).lstrip("/"):  # which keeps two slashes at its beginning
             # Of a volume that an image names so: what it is in or at is said by no comparison here.
             return f"{path or 'nothing'} is no whole path"
         if _KERNEL.fullmatch(path):
