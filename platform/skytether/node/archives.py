@@ -32,6 +32,9 @@ _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 _KERNEL = re.compile(r"/(?:dev|proc|sys)(?:/.*)?", re.DOTALL)
 """What an engine mounts in each container beside, and holds it by."""
 _ANONYMOUS = "[0-9a-f]{64}"
+_MOST_MOUNTS, _MOST_WAYS = 64, 512
+"""Of a container, and folders on the ways to them: an engine mounts all of the first in the machine's own tree, which
+has room for some, whenever it looks into that container; the node asks for each of the second."""
 _STAT = "x-docker-container-path-stat"
 _LINK, _NO_FILE = 1 << 27, 1 << 19
 """Go's bits in a file's mode: of a link, and the lowest of those that say that it is none."""
@@ -91,6 +94,8 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
     if (inspected.get("HostConfig") or {}).get("ReadonlyRootfs") is not True:
         return "it may change its own files"
     mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
+    if len(mounts) > _MOST_MOUNTS or len(ways(inspected)) > _MOST_WAYS:
+        return "it has too many mounts, or at paths that are too long"
     for path in (*mounts, *_FILES, *_in_memory(inspected)):
         if path != "/" + posixpath.normpath(path).lstrip("/"):  # which keeps two slashes at its beginning
             # Of a volume that an image names so: what it is in or at is said by no comparison here.
