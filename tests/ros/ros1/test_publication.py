@@ -99,6 +99,32 @@ def test_messages_are_held_for_a_first_subscriber_and_a_latched_one_for_all():
     run(latched, latched=True)
 
 
+def test_who_begins_to_listen_after_somebody_has_left_counts():
+    """Beside a recorder, say, the wheels' node may have been started again; who only comes besides does not count."""
+
+    async def work(publication, connect):
+        async def listen(count):
+            _, writer, _ = await connect()
+            writers.append(writer)
+            while len(publication.subscribers) != count:
+                await asyncio.sleep(0.001)
+
+        writers = []
+        await listen(1)
+        await listen(2)
+        assert publication.renewed == 0
+        writers[1].close()
+        while len(publication.subscribers) != 1:
+            await asyncio.sleep(0.001)
+        await listen(2)
+        await listen(3)
+        assert publication.renewed == 1
+        for writer in writers:
+            writer.close()
+
+    run(work)
+
+
 def test_what_is_too_old_by_the_time_that_it_is_sent_is_not():
     """The process stood still between `publish` and the thread of the node, or before a slow subscriber had room."""
     now = 100.0

@@ -93,6 +93,7 @@ class Publication:
         topic: Absolute name.
         type: As ROS 1 has it, ``sensor_msgs/LaserScan``.
         md5: Of the type.
+        renewed: How often somebody began to listen after somebody had left, who may be the same.
     """
 
     def __init__(
@@ -133,6 +134,9 @@ class Publication:
         self._clock = clock
         self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
+        self.renewed = 0
+        self._left = False
+        """Whether somebody has left, and nobody begun to listen since."""
         self._refused: set[tuple[str, str]] = set()
 
     @property
@@ -185,12 +189,15 @@ class Publication:
             until, frame = self._held.popleft()
             if time.monotonic() < until:
                 subscriber.send(frame)
+        self.renewed += self._left
+        self._left = False
         self._subscribers.append(subscriber)
         try:
             while await reader.read(4096):
                 pass
         finally:
             self._subscribers.remove(subscriber)
+            self._left = True
             subscriber.close()
 
     def _refusal(self, caller: str, header: dict[str, str]) -> str:

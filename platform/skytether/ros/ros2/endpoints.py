@@ -98,6 +98,7 @@ class Publication(Handle):
     stuck = False
     unread_s = 0.0
     heard = True
+    renewed = 0
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 

@@ -61,6 +61,11 @@ class Publication(Handle, Protocol):
         """
         ...
 
+    @property
+    def renewed(self) -> int:
+        """How often who listens was not known to hear any more: somebody may have come in another's place."""
+        ...
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         ...

@@ -222,6 +222,42 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
     assert peer.heard[0] == 0.0
 
 
+def test_wheels_that_are_started_again_beside_a_recorder_hear_how_a_velocity_begins(ros2_nodes):
+    """Somebody listens all the time, and is not the wheels."""
+    listens = """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+"""
+    stand, forward = encode(Twist()), encode(Twist(linear=Vector3(x=0.5)))
+    with RclpyNode() as node:
+        endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(reliable=True))
+        wheels = node.publish(endpoint, fresh_s=0.1)
+
+        def drive():
+            time.sleep(0.03)
+            return wheels.put(forward if wheels.heard else stand) and wheels.heard
+
+        def listen(name):
+            peer = ros2_nodes.start(listens, name=name)
+            until(lambda: (drive() and peer.heard.extend(peer.all())) or 0.5 in peer.heard, f"{name} to hear")
+            return peer
+
+        base = listen("base")
+        until(lambda: drive() and not wheels.unread_s, "the base to acknowledge")
+        recorder = listen("recorder")
+        assert wheels.renewed == 0, "who listens besides stops nobody"
+        for end in (signal.SIGINT, signal.SIGKILL):
+            base.process.send_signal(end)
+            base.process.wait(10)
+            at = time.monotonic()
+            until(lambda at=at: drive() and time.monotonic() - at > 1.0)
+            base = listen("base")
+            assert base.heard[0] == 0.0, end
+        assert wheels.renewed == 2
+        assert 0.5 in recorder.heard
+        wheels.close()
+
+
 def test_when_ros_is_shut_down_under_our_node_that_is_named_and_it_comes_back(ros2_nodes, monkeypatch, tmp_path):
     """The context is shut down from within, as a signal handler of a library's would."""
     (tmp_path / "sitecustomize.py").write_text(

@@ -64,7 +64,8 @@ class Ros1Wheels(RosWheels[Node]):
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen."""
-        return frozenset(self._publication.subscribers)
+        # Beside a recorder, say, the wheels' node may have been started again.
+        return frozenset(f"{name} {self._publication.renewed}" for name in self._publication.subscribers)
 
 
 class Ros1Sensors(RosSensors[Node]):

@@ -89,7 +89,9 @@ class Ros2Wheels(RosWheels[GraphNode]):
         """Wheels: the nodes that listen, none while they cannot be told anything."""
         if self._publication.stuck or self._publication.refused:
             return frozenset()
-        return frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION))
+        lives = self._node.lives(self._topic, Kind.SUBSCRIPTION)
+        # Beside a recorder, say, the wheels' node may have been started again.
+        return frozenset(f"{life} {self._publication.renewed}" for life in lives)
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

@@ -122,8 +122,10 @@ class Publication(Handle):
         self._published = 0
         """Of those, as this program counts them."""
         self._heard = False
+        self.renewed = 0
+        """See `skytether.ros.ros2.seam.Publication.renewed`."""
         self._begun = False
-        """Whether the program is our node; what may not wait is not put before."""
+        """Whether the program is our node; where only the newest counts, none that may not wait is put before."""
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
@@ -132,7 +134,7 @@ class Publication(Handle):
         body = bytes(payload)
         if self.endpoint.qos.transient_local:
             self._kept = body
-        sender, early = self._sender, self._fresh_s < inf and not self._begun
+        sender, early = self._sender, self._fresh_s < inf and not self._waits and not self._begun
         if sender is None or early or self.refused or self.stuck:
             with self._lock:
                 self.dropped += 1
@@ -170,11 +172,12 @@ class Publication(Handle):
         with self._lock:
             number, now = next(self._numbers), _now()
             self._waiting.append((number, now))
-            return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, body)
+            return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, self._heard, body)
 
     def on_frame(self, frame: Frame) -> None:
         number, unread_s, published, heard = pull_dealt_with(frame.body)
         with self._lock:
+            self.renewed += self._heard and not heard
             self._heard = heard
             self._unread = (_now(), unread_s)
             waited = len(self._waiting)

@@ -7,10 +7,10 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - DATA: one serialised message;
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
-- FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, serialised message, which is published until then
-  or never; from the node the number, float64 seconds for which nobody has acknowledged what was published, uint64 how
-  many of this topic were published so far, and a bool, whether they are heard: this message, and those before it, wait
-  no more.
+- FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, a bool, serialised message, which is published
+  until then or never, and where the bool is true only if all who listen are known to hear; from the node the number,
+  float64 seconds for which nobody has acknowledged what was published, uint64 how many of this topic were published so
+  far, and a bool, whether they are heard: this message, and those before it, wait no more.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Protocol
 
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
-FRESH = struct.Struct("<Qd")
+FRESH = struct.Struct("<Qd?")
 _DEALT_WITH = struct.Struct("<QdQ?")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
@@ -84,13 +84,13 @@ def numbered(kind: Kind, channel: int, number: int, body: bytes) -> Frame:
     return Frame(kind, channel, NUMBER.pack(number) + body)
 
 
-def fresh(channel: int, number: int, until: float, body: bytes) -> Frame:
-    """A frame of a message that is published until then [s], or never."""
-    return Frame(Kind.FRESH, channel, FRESH.pack(number, until) + body)
+def fresh(channel: int, number: int, until: float, heard: bool, body: bytes) -> Frame:
+    """A frame of a message that is published until then [s], or never; and if it is for who hears, to no other."""
+    return Frame(Kind.FRESH, channel, FRESH.pack(number, until, heard) + body)
 
 
-def pull_fresh(body: bytes) -> tuple[int, float, bytes]:
-    """Number, time and message of `fresh`."""
+def pull_fresh(body: bytes) -> tuple[int, float, bool, bytes]:
+    """Number, time, whether it is for who hears, and message of `fresh`."""
     return *FRESH.unpack_from(body), body[FRESH.size :]
 
 

@@ -56,6 +56,8 @@ MAX_ASKED = 64
 """Calls of one service that wait for the agent; who comes then is not answered."""
 NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
+SILENT_S = 0.5
+"""Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 HEARS_S = 3.0
 """For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
 FAREWELL_S = 0.3
@@ -124,10 +126,16 @@ class Program:
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._read_at: dict[int, float] = {}
         """When all that was published had been acknowledged last, where it was at some time [s]."""
+        self._unread: dict[int, float] = {}
+        """For how long it had not been, when a message was published last [s]."""
         self._listened: dict[int, float] = {}
         """Since when somebody listens to what was published [s]."""
         self._heard: set[int] = set()
         """What somebody listens to, and is known to hear."""
+        self._listeners: dict[int, int] = {}
+        """How many listened to that, when a message was published last."""
+        self._left: set[int] = set()
+        """What somebody listened to who does not any more, while others do."""
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -213,12 +221,12 @@ class Program:
             if publisher is not None:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
-            number, until, body = pull_fresh(frame.body)
+            number, until, heeds, body = pull_fresh(frame.body)
             publisher, unread_s, heard = self._publishers.get(frame.channel), 0.0, False
             if publisher is not None:
                 unread_s = self._unread_s(frame.channel, publisher)
                 heard = frame.channel in self._heard
-                if _now() <= until:
+                if _now() <= until and (heard or not heeds):  # or he is new, and it is no first word for him
                     publisher.publish(body)
                     self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
                     if publisher.get_subscription_count():
@@ -252,8 +260,16 @@ class Program:
         except Exception:  # this middleware does not tell
             read = True
         listened = publisher.get_subscription_count()
+        before, self._listeners[channel] = self._listeners.get(channel, 0), listened
         if not listened:
             self._listened.pop(channel, None)
+            self._heard.discard(channel)
+            self._left.discard(channel)
+        elif listened < before:
+            self._left.add(channel)
+        elif listened > before and (channel in self._left or self._unread.get(channel, 0.0) > SILENT_S):
+            self._left.discard(channel)  # the wheels' node may have been started again, beside a recorder
+            self._listened[channel] = now
             self._heard.discard(channel)
         elif channel in self._listened and (read or now - self._listened[channel] > HEARS_S):
             self._heard.add(channel)
@@ -261,7 +277,8 @@ class Program:
             self._read_at[channel] = now
         elif read:
             self._read_at.pop(channel, None)
-        return now - self._read_at.get(channel, now)
+        self._unread[channel] = now - self._read_at.get(channel, now)
+        return self._unread[channel]
 
     def _do_publish(
         self,
@@ -331,8 +348,11 @@ class Program:
         self._names.pop(channel, None)
         self._farewells.pop(channel, None)
         self._read_at.pop(channel, None)
+        self._unread.pop(channel, None)
         self._listened.pop(channel, None)
+        self._listeners.pop(channel, None)
         self._heard.discard(channel)
+        self._left.discard(channel)
         server = self._servers.pop(channel, None)
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
