@@ -11,10 +11,12 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
+from math import inf
 from typing import Any, Protocol, cast
 
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, call_names
 from skytether.bridge.port import Publisher
+from skytether.guard.clock import now as boottime
 from skytether.messages import definition_of, hash_of
 from skytether.ros import notes as graph_notes
 from skytether.ros.followed import Followed
@@ -23,6 +25,7 @@ from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as TF_STATIC
 from skytether.ros.static_tf import StaticTransforms
+from skytether.ros.velocities import VELOCITIES, too_late
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Direction, Role, Topic
 
@@ -144,8 +147,13 @@ class Ros1Port:
     def deliver(self, message: MessageReceived) -> None:
         publication = self._publications.get(message.topic)
         if publication is not None:
-            if self._may(Access.PUBLISH, publication.topic):
-                publication.publish(message.payload)
+            late = too_late(self._agreed[message.topic], message)
+            if late:
+                self._log_once(late)
+            elif self._may(Access.PUBLISH, publication.topic):
+                row = self._agreed[message.topic]
+                until = boottime() + row.lifespan if row.type in VELOCITIES else inf
+                publication.publish(message.payload, until)
         elif message.topic == NOTES[self._other]:
             told = graph_notes.unpack(message.payload)
             if told is None:

@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 from skytether.bridge.calls import REQUEST, RESPONSE, CallError, Handler, call_names
 from skytether.bridge.port import Publisher
-from skytether.messages import Encoding, Twist, TwistStamped, definition_of, hash_of
+from skytether.messages import Encoding, definition_of, hash_of
 from skytether.ros import notes as graph_notes
 from skytether.ros.followed import Followed
 from skytether.ros.names import bridge_type
@@ -24,6 +24,7 @@ from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
+from skytether.ros.velocities import VELOCITIES, too_late
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Role, Topic
 
@@ -39,8 +40,6 @@ SURVEY_S = 0.5
 _EARLY = 16
 """Messages kept of a topic whose type the peer has not told yet."""
 _RIHS = "RIHS01_"
-_VELOCITIES = {Twist.TYPE, TwistStamped.TYPE}
-"""Late, they are worse than none: whoever has them drives on."""
 
 
 @runtime_checkable
@@ -65,12 +64,14 @@ class _Way:
         publication: The same, where we publish.
         refusal: Why nothing goes this way; empty if it does.
         early: What came before the peer has told its type.
+        late: Whether the newest velocity was not published, for it came too late.
     """
 
     handle: Handle | None = None
     publication: Publication | None = None
     refusal: str = ""
     early: deque[MessageReceived] = field(default_factory=lambda: deque(maxlen=_EARLY))
+    late: bool = False
 
 
 class Ros2Port:
@@ -168,7 +169,16 @@ class Ros2Port:
         if way is None or way.publication is None:
             return
         if self._may(Access.PUBLISH, message.topic, way.publication.endpoint.name):
-            way.publication.put(message.payload)
+            late = too_late(self._rows[message.topic], message)
+            if late:
+                way.publication.dropped += 1
+                way.late = True
+                self._node.report(f"late {message.topic}", late)
+            else:
+                if way.late:
+                    way.late = False
+                    self._node.settle(f"late {message.topic}")
+                way.publication.put(message.payload)
 
     def notify(self, event: Event) -> None:
         """Port: see what was agreed with the peer."""
@@ -220,7 +230,7 @@ class Ros2Port:
         if endpoint.kind is Kind.PUBLISHER:
             if self._may(Access.PUBLISH, row.name, endpoint.name):
                 every = row.reliable or row.depth > 1  # not only the newest
-                fresh_s = row.lifespan if endpoint.type in _VELOCITIES and not every else inf
+                fresh_s = row.lifespan if endpoint.type in VELOCITIES else inf
                 way.handle = way.publication = self._node.publish(endpoint, waits=every, fresh_s=fresh_s)
         else:
             send, lose = partial(self._send, row.name), partial(self._lose, row.name)

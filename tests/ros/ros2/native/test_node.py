@@ -307,7 +307,8 @@ node.create_subscription(Twist, "/bot/cmd_vel", lambda m: say(m.linear.x), 100)
     assert wheels.passed == before + 1
 
 
-def test_a_bridge_s_velocity_that_waited_in_a_program_that_hung_is_not_published(ros2_nodes, ours):
+@pytest.mark.parametrize("more", [{}, {"depth": 10}, {"reliable": True, "lifespan": 0.1}])
+def test_a_bridge_s_velocity_that_waited_in_a_program_that_hung_is_not_published(ros2_nodes, ours, more):
     """Its topic's lifespan is over; nobody may say anything after it, and the wheels would drive on."""
     peer = ros2_nodes.start(
         """
@@ -315,7 +316,7 @@ from geometry_msgs.msg import Twist
 node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 100)
 """
     )
-    row = Topic("cmd_vel", TWIST, Direction.OUT)
+    row = Topic("cmd_vel", TWIST, Direction.OUT, **more)
     made = []
 
     def publish(*arguments, **options):
@@ -332,12 +333,36 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 100)
 
     until(lambda: deliver(0.5) or peer.all(), "the first velocity")
     os.kill(ours.pid, signal.SIGSTOP)
+    time.sleep(0.1)  # until it does stand still
     until(lambda: deliver(2.5) or way.stuck, "the program to be stuck")
     peer.all()
     os.kill(ours.pid, signal.SIGCONT)
     until(lambda: not way.stuck, "the program to go on")
     until(lambda: deliver(0.0) or peer.heard.extend(peer.all()) or 0.0 in peer.heard, "a velocity again")
     assert 2.5 not in peer.heard
+    port.close()
+
+
+def test_a_bridge_s_velocity_that_comes_late_is_not_published_and_that_is_told(ours):
+    """This end, or the network, stood still: what waited comes at once, and nobody may say anything after it."""
+    row = Topic("cmd_vel", TWIST, Direction.OUT)
+    port = Ros2Port(ours, [row], Role.ROBOT)
+    port.attach(Mock())
+    (way,) = [handle for handle in ours._handles.values() if handle.endpoint.name == "/cmd_vel"]  # noqa: SLF001
+
+    def deliver(sent_at, error):
+        port.deliver(MessageReceived(row.name, encode(Twist()), 0, sent_at, error, 10.0))
+
+    until(lambda: deliver(10.0, 0.0) or way.passed, "a velocity in time")
+    passed = way.passed
+    for _ in range(20):
+        deliver(7.0, 0.01)
+        time.sleep(0.01)
+    assert way.passed <= passed + 1  # one may have been on its way
+    told = "cmd_vel: velocities that come more than 0.1 s after they were sent (lifespan_ms) are not published"
+    assert any(text.startswith(told) for text in ours.troubles)
+    until(lambda: deliver(9.85, 0.06) or way.passed > passed + 1, "one that may be young enough")
+    assert not any(text.startswith(told) for text in ours.troubles)
     port.close()
 
 
