@@ -366,6 +366,35 @@ def test_a_bridge_s_velocity_that_comes_late_is_not_published_and_that_is_told(o
     port.close()
 
 
+def test_a_velocity_that_waited_for_a_program_that_hung_is_not_taken(ros2_nodes, ours):
+    """Whoever drives may have fallen silent meanwhile, and the last that he said would come seconds later."""
+    peer = ros2_nodes.start(
+        """
+from geometry_msgs.msg import Twist
+pub = node.create_publisher(Twist, "/driver", 10)
+def drive():
+    for line in sys.stdin:
+        m = Twist()
+        m.linear.x = float(line)
+        pub.publish(m)
+threading.Thread(target=drive, daemon=True).start()
+"""
+    )
+    heard = []
+    endpoint = Endpoint(Kind.SUBSCRIPTION, "/driver", TWIST, hash_of(TWIST, "cdr"), Qos(reliable=True, depth=10))
+    way = ours.subscribe(endpoint, lambda payload: heard.append(decode(Twist, payload, "cdr").linear.x))
+    until(lambda: peer.tell("0.5") or time.sleep(0.02) or len(heard) > 5, "velocities")
+    os.kill(ours.pid, signal.SIGSTOP)
+    time.sleep(0.1)
+    for _ in range(5):
+        peer.tell("2.5")
+    time.sleep(0.6)
+    os.kill(ours.pid, signal.SIGCONT)
+    until(lambda: peer.tell("0.75") or time.sleep(0.02) or 0.75 in heard, "a velocity again")
+    assert 2.5 not in heard
+    until(lambda: way.dropped >= 5, "them to be counted")
+
+
 def test_there_is_a_node_where_no_log_can_be_written(ros2_nodes, monkeypatch):
     """As below systemd's ProtectHome; ROS 2 has its log files below the home folder."""
     for name in ("ROS_LOG_DIR", "ROS_HOME"):

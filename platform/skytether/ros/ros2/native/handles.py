@@ -19,7 +19,7 @@ from skytether.bridge.calls import CallError
 from ..dialect import Endpoint
 from ..qos import Qos, follow
 from .overrun import Overrun
-from .side.frames import Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_number
+from .side.frames import Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)
@@ -276,9 +276,15 @@ class Subscription(Handle):
         if self.refused:
             self.dropped += 1
             return
+        body = frame.body
+        if frame.kind is Kind.FRESH:
+            _, until, _, body = pull_fresh(body)
+            if _now() > until:  # this process stood still
+                self.lose(1)
+                return
         self.passed += 1
         try:
-            self._on_message(frame.body)
+            self._on_message(body)
         except Exception:  # the node's thread must live on
             _log.exception("A message of %s was lost", self.endpoint.name)
 

@@ -10,7 +10,8 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, a bool, serialised message, which is published
   until then or never, and where the bool is true only if all who listen are known to hear; from the node the number,
   float64 seconds for which nobody has acknowledged what was published, uint64 how many of this topic were published so
-  far, and a bool, whether they are heard: this message, and those before it, wait no more.
+  far, and a bool, whether they are heard: this message, and those before it, wait no more. A velocity
+  of a subscription comes from the node as others go to it, and is taken until then or never.
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ from .frames import (
     Kind,
     control,
     dealt_with,
+    fresh,
     numbered,
     pull_frame,
     pull_fresh,
@@ -58,6 +59,13 @@ NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
 SILENT_S = 0.5
 """Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
+VELOCITIES = {"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"}
+"""Late, they are worse than none: whoever has them drives on."""
+STOOD_S = 0.3
+"""Without a turn: this process stood still, and what waited for it is old."""
+DRAINED_S = 0.2
+"""For what waited meanwhile to come; no velocity is taken until then."""
+_TURN_S = 0.05
 HEARS_S = 3.0
 """For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
 FAREWELL_S = 0.3
@@ -136,6 +144,9 @@ class Program:
         """How many listened to that, when a message was published last."""
         self._left: set[int] = set()
         """What somebody listened to who does not any more, while others do."""
+        self._turned = 0.0
+        """When this process was seen to run last, while it takes velocities, and when it went on [s]."""
+        self._went_on = 0.0
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -317,8 +328,16 @@ class Program:
         self._sender.set(channel, priority, keep)
 
         def put(message: bytes) -> None:
-            self._sender.put(Frame(Kind.DATA, channel, message))
+            if kind in VELOCITIES and self._has_stood_still():
+                self._lost[channel] = self._lost.get(channel, 0) + 1
+            elif kind in VELOCITIES:
+                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
+            else:
+                self._sender.put(Frame(Kind.DATA, channel, message))
 
+        if kind in VELOCITIES and not self._turned:
+            self._turned = _now()
+            threading.Thread(target=self._turn, daemon=True).start()
         before = self._subscriptions.pop(channel, None)
         cls, qos = types.load(kind), graph.profile(reliable, transient_local, depth)
         try:
@@ -328,6 +347,19 @@ class Program:
         self._subscriptions[channel] = new
         if before is not None:
             self._node.destroy_subscription(before)
+
+    def _turn(self) -> None:
+        while not self._ended.is_set():
+            self._has_stood_still()
+            self._turned = _now()
+            time.sleep(_TURN_S)
+
+    def _has_stood_still(self) -> bool:
+        """Whether this process did a moment ago, so that what comes may have waited for it."""
+        now = _now()
+        if now - self._turned > STOOD_S:
+            self._went_on = now
+        return now - self._went_on < DRAINED_S
 
     def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
         self._names[channel] = name
