@@ -25,7 +25,7 @@ from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as TF_STATIC
 from skytether.ros.static_tf import StaticTransforms
-from skytether.ros.velocities import VELOCITIES, too_late
+from skytether.ros.velocities import VELOCITIES, HeldBack
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Direction, Role, Topic
 
@@ -122,6 +122,7 @@ class Ros1Port:
         self._peer: Peer
         self._lock = threading.Lock()
         self._publications: dict[str, Publication] = {}
+        self._held_back: dict[str, HeldBack] = {}
         self._early: dict[str, deque[bytes | memoryview]] = {}
         self._servers: dict[str, ServiceServer] = {}
         self._ends: list[Callable[[], None]] = []
@@ -147,11 +148,13 @@ class Ros1Port:
     def deliver(self, message: MessageReceived) -> None:
         publication = self._publications.get(message.topic)
         if publication is not None:
-            late = too_late(self._agreed[message.topic], message)
-            if late:
-                self._log_once(late)
+            row = self._agreed[message.topic]
+            held_back = self._held_back.get(message.topic)
+            if held_back is None:
+                held_back = self._held_back[message.topic] = HeldBack(row)
+            if held_back.is_late(message):
+                self._log_once(held_back.reason)
             elif self._may(Access.PUBLISH, publication.topic):
-                row = self._agreed[message.topic]
                 until = boottime() + row.lifespan if row.type in VELOCITIES else inf
                 publication.publish(message.payload, until)
         elif message.topic == NOTES[self._other]:

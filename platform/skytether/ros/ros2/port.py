@@ -24,7 +24,7 @@ from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
 from skytether.ros.static_tf import TOPIC as STATIC_TF
 from skytether.ros.static_tf import StaticTransforms
-from skytether.ros.velocities import VELOCITIES, too_late
+from skytether.ros.velocities import VELOCITIES, HeldBack
 from skytether.wire.events import Connected, Event, MessageReceived
 from skytether.wire.topic import ANY, Role, Topic
 
@@ -64,14 +64,14 @@ class _Way:
         publication: The same, where we publish.
         refusal: Why nothing goes this way; empty if it does.
         early: What came before the peer has told its type.
-        late: Whether the newest velocity was not published, for it came too late.
+        held_back: Which velocities of it were.
     """
 
     handle: Handle | None = None
     publication: Publication | None = None
     refusal: str = ""
     early: deque[MessageReceived] = field(default_factory=lambda: deque(maxlen=_EARLY))
-    late: bool = False
+    held_back: HeldBack | None = None
 
 
 class Ros2Port:
@@ -169,14 +169,15 @@ class Ros2Port:
         if way is None or way.publication is None:
             return
         if self._may(Access.PUBLISH, message.topic, way.publication.endpoint.name):
-            late = too_late(self._rows[message.topic], message)
-            if late:
+            held_back = way.held_back
+            if held_back is None:
+                held_back = way.held_back = HeldBack(self._rows[message.topic])
+            held = held_back.holds
+            if held_back.is_late(message):
                 way.publication.dropped += 1
-                way.late = True
-                self._node.report(f"late {message.topic}", late)
+                self._node.report(f"late {message.topic}", held_back.reason)
             else:
-                if way.late:
-                    way.late = False
+                if held:
                     self._node.settle(f"late {message.topic}")
                 way.publication.put(message.payload)
 

@@ -348,51 +348,27 @@ def test_a_bridge_s_velocity_that_comes_late_is_not_published_and_that_is_told(o
     row = Topic("cmd_vel", TWIST, Direction.OUT)
     port = Ros2Port(ours, [row], Role.ROBOT)
     port.attach(Mock())
-    (way,) = [handle for handle in ours._handles.values() if handle.endpoint.name == "/cmd_vel"]  # noqa: SLF001
+    dropped = []
 
-    def deliver(sent_at, error):
-        port.deliver(MessageReceived(row.name, encode(Twist()), 0, sent_at, error, 10.0))
+    def deliver(sent_at):
+        port.deliver(MessageReceived(row.name, encode(Twist()), 0, sent_at, 0.01, 10.0))
 
-    until(lambda: deliver(10.0, 0.0) or way.passed, "a velocity in time")
-    passed = way.passed
+    def passed():
+        (way,) = port.topics()
+        dropped.append(way.dropped)
+        return way.passed
+
+    until(lambda: deliver(10.0) or passed(), "a velocity in time")
+    before = dropped[-1]
     for _ in range(20):
-        deliver(7.0, 0.01)
-        time.sleep(0.01)
-    assert way.passed <= passed + 1  # one may have been on its way
-    told = "cmd_vel: velocities that come more than 0.1 s after they were sent (lifespan_ms) are not published"
+        deliver(7.0)
+    passed()
+    assert dropped[-1] >= before + 20
+    told = "cmd_vel: velocities that come 0.1 s (lifespan_ms) later than those before them are not published"
     assert any(text.startswith(told) for text in ours.troubles)
-    until(lambda: deliver(9.85, 0.06) or way.passed > passed + 1, "one that may be young enough")
+    deliver(9.95)
     assert not any(text.startswith(told) for text in ours.troubles)
     port.close()
-
-
-def test_a_velocity_that_waited_for_a_program_that_hung_is_not_taken(ros2_nodes, ours):
-    """Whoever drives may have fallen silent meanwhile, and the last that he said would come seconds later."""
-    peer = ros2_nodes.start(
-        """
-from geometry_msgs.msg import Twist
-pub = node.create_publisher(Twist, "/driver", 10)
-def drive():
-    for line in sys.stdin:
-        m = Twist()
-        m.linear.x = float(line)
-        pub.publish(m)
-threading.Thread(target=drive, daemon=True).start()
-"""
-    )
-    heard = []
-    endpoint = Endpoint(Kind.SUBSCRIPTION, "/driver", TWIST, hash_of(TWIST, "cdr"), Qos(reliable=True, depth=10))
-    way = ours.subscribe(endpoint, lambda payload: heard.append(decode(Twist, payload, "cdr").linear.x))
-    until(lambda: peer.tell("0.5") or time.sleep(0.02) or len(heard) > 5, "velocities")
-    os.kill(ours.pid, signal.SIGSTOP)
-    time.sleep(0.1)
-    for _ in range(5):
-        peer.tell("2.5")
-    time.sleep(0.6)
-    os.kill(ours.pid, signal.SIGCONT)
-    until(lambda: peer.tell("0.75") or time.sleep(0.02) or 0.75 in heard, "a velocity again")
-    assert 2.5 not in heard
-    until(lambda: way.dropped >= 5, "them to be counted")
 
 
 def test_there_is_a_node_where_no_log_can_be_written(ros2_nodes, monkeypatch):
