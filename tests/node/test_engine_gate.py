@@ -450,6 +450,10 @@ def volume(path: str, name: str = ID) -> dict[str, str]:
         ([volume("/w"), volume("/w/a/b")], {}, set(), b"/w/a/b is in /w, where things can be moved"),
         ([volume("/w", "skytether-w"), volume("/w/a")], {}, set(), b"/w/a is in /w, where things can be moved"),
         ([volume("/etc", "skytether-w")], {}, set(), b"/etc/hosts is in /etc, where things can be moved"),
+        # What ran may leave a pipe there, of its own volume too: the next start waits for it for ever.
+        ([volume("/etc")], {}, set(), b"/etc/group is in a volume, where things can be moved"),
+        ([volume("/etc/passwd")], {}, set(), b"/etc/passwd is in a volume"),
+        ([volume("/etc/passwd.d"), volume("/etcetera")], {}, set(), b""),
         ([volume(f"/v{number}") for number in range(64)], {}, set(), b""),
         ([volume(f"/v{number}") for number in range(65)], {}, set(), b"it has too many mounts"),
         ([volume("/a" * 600)], {}, set(), b"it has too many mounts, or at paths that are too long"),

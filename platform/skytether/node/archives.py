@@ -107,7 +107,9 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
             own = mount.get("Type") == "volume" and re.fullmatch(_ANONYMOUS, str(mount.get("Name")))
             if below and not (own and posixpath.dirname(path) == above):
                 return f"{path} is in {above}, where things can be moved"
-    return None
+    # Nothing is mounted there that the kernel would hold: what ran could leave a pipe, for the next start.
+    users = (path for path in sorted(_USERS) if any(path == one or path.startswith(f"{one}/") for one in mounts))
+    return next((f"{path} is in a volume, where things can be moved" for path in users), None)
 
 
 def _in_memory(inspected: Mapping[str, Any]) -> list[str]:
