@@ -7,6 +7,7 @@ import base64
 import gzip
 import io
 import json
+import socket
 import socketserver
 import tarfile
 import tempfile
@@ -15,13 +16,14 @@ from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock, Mock
+from unittest.mock import AsyncMock, MagicMock, Mock
 from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
 
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
+from skytether.node.machine import is_taken
 from skytether.node.registries import registry_of
 
 ID, OTHER = "f" * 64, "e" * 64
@@ -379,6 +381,42 @@ def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Eng
     ):
         engine.container, engine.links = {"HostConfig": {**host, **more}, "Mounts": mounts}, {"/lib"}
         assert says in say(engine, start)
+
+
+@pytest.mark.parametrize("address", ["", "127.0.0.1", "::1"])
+def test_no_container_is_published_at_a_port_that_a_program_of_this_machine_has(engine: Engine, address: str) -> None:
+    """Engines lead there what comes for it, until they find that it is taken; connected, it is published, too."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    joins = request("POST /v1.41/networks/skytether/connect", json.dumps({"Container": ID}).encode())
+    starts = request(f"POST /v1.41/containers/{ID}/start")
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind((address, 0))
+        port = program.getsockname()[1]
+        bindings = {"7600/udp": [{"HostIp": address, "HostPort": str(port)}]}
+        host = {"NetworkMode": "skytether", "ReadonlyRootfs": True, "PortBindings": bindings}
+        engine.container = {"HostConfig": host}
+        for sent in (joins, starts):
+            assert f"UDP port {port} of {address or '0.0.0.0'}: address already in use".encode() in say(engine, sent)
+        assert not any(line.startswith("POST") for line in engine.lines)
+        engine.container = {"HostConfig": host, "NetworkSettings": {"Ports": bindings}}  # it has it itself
+        assert b"200 OK" in say(engine, starts)
+    engine.container = {"HostConfig": host}
+    for sent in (joins, starts):
+        assert b"200 OK" in say(engine, sent)
+
+
+def test_of_ports_that_are_for_root_alone_it_is_seen_too_whether_they_are_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        port = program.getsockname()[1]
+        refusing = MagicMock()
+        refusing.return_value.__exit__.return_value = False
+        refusing.return_value.__enter__.return_value.bind.side_effect = PermissionError
+        monkeypatch.setattr("skytether.node.machine.socket.socket", refusing)
+        assert is_taken("0.0.0.0", port)
+    assert not is_taken("0.0.0.0", port)
 
 
 @pytest.mark.parametrize("path", ["/etc/passwd", "/etc/group"])

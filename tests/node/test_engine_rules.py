@@ -246,6 +246,15 @@ HOST: dict[str, Any] = {
         ({"PidsLimit": -1}, "its PidsLimit is -1"),
         ({"PidsLimit": True}, "its PidsLimit is True"),
         ({"PortBindings": {"7600/udp": [{"HostPort": "1"}, {"HostPort": "2"}]}}, "it publishes too many ports"),
+        # Of other addresses and ports, the node does not see whether they are free.
+        ({"PortBindings": {"7600/udp": [{"HostPort": "7600-7700"}]}}, "it is published at :7600-7700"),
+        ({"PortBindings": {"7600/udp": [{"HostPort": "65536"}]}}, "it is published at :65536"),
+        ({"PortBindings": {"7600/udp": [{"HostPort": "07600"}]}}, "it is published at :07600"),
+        ({"PortBindings": {"7600/udp": [{"HostIp": "127.0.0.01", "HostPort": "1"}]}}, "published at 127.0.0.01:1"),
+        ({"PortBindings": {"7600/udp": [{"HostIp": "::ffff:127.0.0.1"}]}}, "published at ::ffff:127.0.0.1:"),
+        ({"PortBindings": {"7600/udp": [{"HostIp": "fe80::1%eth0"}]}}, "published at fe80::1%eth0:"),
+        ({"PortBindings": {"7600/udp": [{"HostPort": "1", "hostport": "2"}]}}, "a port has 'hostport'"),
+        ({"PortBindings": {"7600/udp": ["53"]}}, "it is published at 53"),
     ],
 )
 def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any], says: str) -> None:

@@ -22,8 +22,8 @@ from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
 from .archives import Images, cleaned, moved, ways
-from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, WEIGHED, Call, Subject, judge, plain
-from .machine import Answer, ask
+from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, PORT, WEIGHED, Call, Subject, judge, plain, published
+from .machine import Answer, ask, is_taken
 from .registries import Registries
 
 log = logging.getLogger(__name__)
@@ -188,6 +188,8 @@ class EngineGate:
             await self._may_be_opened(subjects[0][1])
         elif plain(call.path).endswith("/start"):
             await self._may_be_started(subjects[0][1])
+        elif plain(call.path).endswith("/connect"):
+            _may_be_published((await self._asked(f"/containers/{subjects[0][1]}/json"))[1])
 
     async def _may_be_pulled(self, image: str) -> None:
         """Raises if something else of this machine has that name: who starts it by that name would start ours."""
@@ -234,6 +236,7 @@ class EngineGate:
         status, found = await self._asked(f"/containers/{container}/json")
         if status != HTTPStatus.OK:
             raise RefusedCall(f"No such container: {container}", HTTPStatus.NOT_FOUND)
+        _may_be_published(found)
         mode = str((found.get("HostConfig") or {}).get("NetworkMode"))
         for name in sorted({*((found.get("NetworkSettings") or {}).get("Networks") or ()), mode}):
             if not name.startswith("container:") and not await self._is_ours(("joined networks", name)):
@@ -304,6 +307,21 @@ class EngineGate:
             self._ours = self._ours if len(self._ours) < _KNOWN else set()
             self._ours.add(name)
         return True
+
+
+def _may_be_published(inspected: Any) -> None:
+    """Raises if a program of this machine has the UDP port that a container is to be published at.
+
+    An engine (20.10) first leads there what comes for it, and only then finds that it is taken.
+    """
+    if ((inspected.get("NetworkSettings") or {}).get("Ports") or {}).get(PORT):
+        return  # it has it already
+    for bound in ((inspected.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT) or ():
+        if refused := published(bound):
+            raise RefusedCall(refused)
+        address, port = bound.get("HostIp") or "0.0.0.0", bound.get("HostPort")  # noqa: S104 (nobody listens)
+        if port and is_taken(address, int(port)):
+            raise RefusedCall(f"UDP port {port} of {address}: address already in use")
 
 
 async def _answer(back: asyncio.StreamWriter, status: int, body: bytes, rows: str) -> None:

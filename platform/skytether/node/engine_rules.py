@@ -9,6 +9,7 @@ learns in a later version is refused until somebody has thought of it.
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 from collections.abc import Iterable, Mapping, Set
@@ -77,7 +78,7 @@ _HOST = _LIMITS | {
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
-_PORTS = {"7600/udp"}
+PORT = "7600/udp"
 """Inside: where a service's end of the bridge is."""
 _OURS = "skytether-"
 """What names of ours begin with: of containers, of networks but for one, and of volumes that outlive their containers.
@@ -101,6 +102,7 @@ _LOG_OPTIONS = {"max-size": re.compile("[1-9][0-9]{0,3}[km]"), "max-file": re.co
 """Of a log. By others an engine does what costs the machine and not the container: of a ``tag`` it makes a text, by a
 template that may ask for one of any length, and so of any memory; and it keeps lines in memory where it need not wait.
 """
+_LAST_PORT = 65_535
 _MOST_PORTS = 1
 """Published: each costs the machine a process of root or two."""
 
@@ -238,16 +240,17 @@ def _archive(call: Call) -> str | None:
 def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
     host = _at(body, "HostConfig")
     mode = _text(host, "NetworkMode")
-    pids, ports = host.get("PidsLimit"), _at(host, "PortBindings").values()
+    pids, bindings = host.get("PidsLimit"), [_list(_at(host, "PortBindings"), PORT)]
     checks = (
         _only(body, _CONTAINER, "a container"),
         _only(host, _HOST, "a container"),
         None if OWNER in _at(body, "Labels") else f"it has no label {OWNER}",
         None if re.fullmatch(f"container:{_CONTAINER_ID}|{_ID}", mode) else f"its network is '{mode[:80]}'",
         None if mode.startswith("container:") else _network_name(mode),
-        _only(_at(body, "ExposedPorts"), _PORTS, "a container"),
-        _only(_at(host, "PortBindings"), _PORTS, "a container"),
-        None if all(len(bound or ()) <= _MOST_PORTS for bound in ports) else "it publishes too many ports",
+        _only(_at(body, "ExposedPorts"), {PORT}, "a container"),
+        _only(_at(host, "PortBindings"), {PORT}, "a container"),
+        *(published(one) for bound in bindings for one in bound),
+        None if all(len(bound) <= _MOST_PORTS for bound in bindings) else "it publishes too many ports",
         None if host.get("ReadonlyRootfs") is True else "it may change its own files",
         None if type(pids) is int and 0 < pids <= _MOST_PIDS else f"its PidsLimit is {str(pids)[:80]}",
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",
@@ -281,6 +284,28 @@ def _security(options: Any, *, guards: bool) -> str | None:
     if guards and not (profiles and all(keeps_in(profile[8:]) for profile in profiles)):
         return "a guard has a seccomp profile by which its right ends at its own network"
     return None
+
+
+def published(bound: Any) -> str | None:
+    """Why a container is not published there, in a sentence.
+
+    At plain ports it is, of which the node sees whether they are free. Of an address that is none an engine makes all.
+    """
+    if not isinstance(bound, dict):
+        return f"it is published at {str(bound)[:40]}"
+    address, port = bound.get("HostIp") or "", bound.get("HostPort") or ""
+    plain_port = port == "" or (re.fullmatch("[1-9][0-9]{0,4}", str(port)) and int(port) <= _LAST_PORT)
+    if not plain_port or (address and not _is_plain_address(address)):
+        return f"it is published at {str(address)[:40]}:{str(port)[:40]}"
+    return _only(bound, {"HostIp", "HostPort"}, "a port")
+
+
+def _is_plain_address(text: Any) -> bool:
+    try:
+        found = ipaddress.ip_address(str(text))
+    except ValueError:
+        return False
+    return str(found) == text and "%" not in text and getattr(found, "ipv4_mapped", None) is None
 
 
 def _network_name(name: str) -> str | None:

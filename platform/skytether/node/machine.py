@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import http.client
 import json
@@ -185,6 +186,25 @@ def address_towards(url: str) -> str | None:
             return str(probe.getsockname()[0]).partition("%")[0]
     except OSError:
         return None
+
+
+def is_taken(address: str, port: int) -> bool:
+    """Whether a program of this machine has that UDP port, at that address or at all."""
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            if ":" in address:
+                probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+            probe.bind((address, port))
+        except PermissionError:  # a port of root's, and the node's program has no right
+            return any(_has_port(Path(f"/proc/net/{table}"), port) for table in ("udp", "udp6"))
+        except OSError as error:
+            return error.errno == errno.EADDRINUSE
+    return False
+
+
+def _has_port(table: Path, port: int) -> bool:
+    rows = table.read_text().splitlines()[1:] if table.exists() else []
+    return any(int(row.split()[1].rpartition(":")[2], 16) == port for row in rows)
 
 
 def own_addresses() -> set[str]:
