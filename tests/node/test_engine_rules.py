@@ -384,6 +384,7 @@ def allowed(*names: str, **more: Any) -> dict[str, Any]:
 
 
 NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ"}
+OF_FAMILY = {"index": 0, "value": 2, "op": "SCMP_CMP_EQ"}
 
 
 @pytest.mark.parametrize(
@@ -407,6 +408,21 @@ NEW = {"index": 0, "value": 0x7E020000, "valueTwo": 0, "op": "SCMP_CMP_MASKED_EQ
         (allowed("clone", args=[{**NEW, "index": 1}], includes={"arches": ["s390", "s390x"]}), True),
         (allowed("clone", args=[{**NEW, "index": 1}], includes={"arches": ["s390x", "amd64"]}), False),
         (allowed("clone", args=[7]), False),
+        # To the kernel's ciphers, and to the machine below this one.
+        (allowed("read", "socket"), False),
+        (allowed("socketcall"), False),
+        (allowed("socket", args=[OF_FAMILY]), True),
+        (allowed("socket", args=[OF_FAMILY, {**OF_FAMILY, "index": 2}]), True),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 38, "op": "SCMP_CMP_LT"}]), True),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 39, "op": "SCMP_CMP_LT"}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 38}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 40}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "value": (1 << 32) + 40}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 40, "op": "SCMP_CMP_NE"}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "value": 40, "op": "SCMP_CMP_GT"}]), False),
+        (allowed("socket", args=[OF_FAMILY, {**OF_FAMILY, "value": 40}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "Value": 40}]), False),
+        (allowed("socket", args=[{**OF_FAMILY, "index": 1}]), False),
         ({"Names": ["unshare"], "action": "SCMP_ACT_ALLOW"}, False),
         ({"names": ["unshare"], "action": "SCMP_ACT_LOG"}, False),
         ({"names": ["unshare"], "action": "SCMP_ACT_NOTIFY"}, False),

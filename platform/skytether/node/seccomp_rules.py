@@ -32,6 +32,7 @@ _WAYS_OUT = {
     # Newer engines refuse them, or what they do with others' processes and memory.
     *("io_uring_setup", "io_uring_enter", "io_uring_register", "process_vm_readv", "process_vm_writev", "kcmp"),
     *("open_tree_attr", "uselib", "ustat", "sysfs", "_sysctl", "iopl", "ioperm", "lookup_dcookie", "vm86old"),
+    "socketcall",  # whose arguments are in memory, where no filter sees them
     *("add_key", "keyctl", "request_key", "quotactl", "swapon", "swapoff", "acct", "syslog", "nfsservctl", "vm86"),
 }
 _CALL = re.compile("[a-z_][a-z0-9_]*")
@@ -44,7 +45,12 @@ _GUARDS = {"CAP_NET_ADMIN"}
 _ONE_FAMILY = tuple([{"index": 0, "value": family, "op": "SCMP_CMP_EQ"}] for family in (1, 2, 10))
 _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "value": 12, "op": "SCMP_CMP_EQ"}]
 """Arguments of sockets: of AF_UNIX, AF_INET and AF_INET6; and of AF_NETLINK that for netfilter."""
+_AF_ALG, _AF_VSOCK = 38, 40
+"""Families of sockets that newer engines refuse: to the kernel's ciphers, and to the machine below this one, which has
+no network of its own for each container. An `NE` or a `GT` refuses neither: of a family, the kernel reads half of what
+a filter compares."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
+_ARGUMENT = {"index", "value", "valueTwo", "op"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
 
 
@@ -107,8 +113,22 @@ def _closed(entry: Mapping[str, Any]) -> bool:
     # Another spelling may mean one of them all the same: what looks it up in C ends it at its first zero.
     if not all(isinstance(name, str) and _CALL.fullmatch(name) for name in allowed):
         return False
-    return not _WAYS_OUT & set(allowed) and (
-        "clone" not in allowed or _within(entry.get("args"), includes.get("arches"))
+    if _WAYS_OUT & set(allowed) or ("socket" in allowed and not _of_known_families(entry.get("args"))):
+        return False
+    return "clone" not in allowed or _within(entry.get("args"), includes.get("arches"))
+
+
+def _of_known_families(arguments: Any) -> bool:
+    given = [one for one in arguments if isinstance(one, dict)] if isinstance(arguments, list) else []
+    found = {one.get("index"): one for one in given if type(one.get("index")) is int}
+    family = found.get(0, {})
+    if not given or len(found) != len(arguments) or any(one.keys() - _ARGUMENT for one in given):
+        return False  # of two for one place, either is enough
+    value = family.get("value")
+    if type(value) is not int:
+        return False
+    return (family.get("op") == "SCMP_CMP_LT" and value <= _AF_ALG) or (
+        family.get("op") == "SCMP_CMP_EQ" and value < 1 << 32 and value not in (_AF_ALG, _AF_VSOCK)
     )
 
 
