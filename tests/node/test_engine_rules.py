@@ -324,6 +324,14 @@ def test_nothing_else_is_passed_on(method: str, path: str, body: Any, query: dic
     assert judge(Call(method, path, query, body))[0]
 
 
+@pytest.mark.parametrize("address", ["", "0.0.0.0", "192.0.2.1", "::", "::1", "2001:DB8::01"])
+def test_a_container_is_published_at_a_plain_address(address: str) -> None:
+    for port in ("", "7600", "65535"):
+        bindings = {"7600/udp": [{"HostIp": address, "HostPort": port}]}
+        body = {"Image": "a", "Labels": OWNER, "HostConfig": {**HOST, "PortBindings": bindings}}
+        assert asked("POST", "/containers/create", body) is None
+
+
 def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are() -> None:
     mounts = [named(NoCopy=True)]
     held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": mounts}

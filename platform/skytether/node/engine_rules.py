@@ -305,7 +305,7 @@ def _is_plain_address(text: Any) -> bool:
         found = ipaddress.ip_address(str(text))
     except ValueError:
         return False
-    return str(found) == text and "%" not in text and getattr(found, "ipv4_mapped", None) is None
+    return isinstance(text, str) and "%" not in text and getattr(found, "ipv4_mapped", None) is None
 
 
 def _network_name(name: str) -> str | None:
