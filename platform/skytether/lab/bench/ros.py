@@ -22,6 +22,7 @@ from typing import Any
 import psutil
 
 from skytether.lab.ros2_python import ros2_python
+from skytether.lab.throttle import cpu_time
 
 from .pair import LOOPBACK, BenchError, free_port
 from .ros2_node import Node, check_python
@@ -250,4 +251,4 @@ def _run(scene: _Scene, indices: list[int], seconds: float, warm_up: float) -> _
 
 def _cpu_s(process: psutil.Process) -> float:
     """Of a process and all that it started and that still runs."""
-    return sum(sum(p.cpu_times()[:2]) for p in (process, *process.children(recursive=True)))
+    return sum(cpu_time(p.pid) for p in (process, *process.children(recursive=True)))
