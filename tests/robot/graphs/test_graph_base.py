@@ -71,6 +71,27 @@ def test_a_standstill_that_could_not_be_told_is_told_when_it_can_be():
     assert not any(sent[1:])
 
 
+def test_wheels_that_do_not_hear_are_told_to_stand_and_that_is_an_error_once_it_is_taken():
+    """Who begins to hear would else hear a velocity in its middle."""
+    sent, can = [], {"heard": False, "taken": False}
+
+    def send(data):
+        sent.append(decode(Twist, data, "ros1").linear.x)
+        return can["taken"]
+
+    base = GraphBase({}, "ros1", send, idle_s=1.0, heard=lambda: can["heard"])
+    drive(base, 0.0, 0.2)
+    can["taken"] = True
+    with pytest.raises(ConnectionError, match="told to stand until their node listens and hears us"):
+        drive(base, 0.1, 0.2)
+    for tick in range(20):
+        drive(base, 0.2 + tick, 0.0)
+    assert sent == 22 * [0.0]
+    can["heard"] = True
+    drive(base, 30.0, 0.2)
+    assert sent[22:] == [0.2]
+
+
 def test_a_standstill_is_told_for_ever_if_asked_to_and_the_message_is_the_graph_s_own():
     sent = []
     base = GraphBase({}, "cdr", sent.append, idle_s=None, make=lambda twist: String(str(twist.linear.x)))

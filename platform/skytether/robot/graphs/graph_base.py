@@ -90,7 +90,8 @@ class GraphBase:
         send: Publishes a serialised velocity; must return at once.
         make: Turns the velocity into the message that the wheels take.
         idle_s: See `IDLE_S`; None: a standstill is told for ever.
-        heard: Whether the wheels hear what is sent; as long as they do not, a standstill is told again and again.
+        heard: Whether the wheels hear what is sent; as long as they do not, a standstill is told again and again,
+            whatever the velocity. It is an error once ``send`` has returned true for it.
     """
 
     def __init__(
@@ -140,17 +141,21 @@ class GraphBase:
 
     def write(self, twist: Twist) -> None:
         """RobotHardware: tell the wheels; a standstill that lasts is not told any more."""
+        heard = self._heard()
         if twist != _STANDSTILL:
             self._stood_since = None
         elif self._stood_since is None:
             self._stood_since = self._now
-        elif self._idle_s is not None and self._now - self._stood_since > self._idle_s and self._heard():
+        elif self._idle_s is not None and self._now - self._stood_since > self._idle_s and heard:
             return
+        told = twist if heard else _STANDSTILL  # who begins to hear is to hear how the velocity begins, too
         try:
-            self._send(encode(self._make(twist), self._encoding))
+            taken = self._send(encode(self._make(told), self._encoding))
         except Exception:
             self._stood_since = None  # a standstill lasts from when the wheels were told of it
             raise
+        if taken and told != twist:
+            raise ConnectionError("the wheels are told to stand until their node listens and hears us")
 
 
 _STANDSTILL = Twist()

@@ -85,8 +85,6 @@ class Ros2Robot(RosRobot):
         self._own: list[tuple[str, Handle]] = []
         """Readings and wheels, by the robot's names."""
         self._told = False
-        self._goes = False
-        """Whether the velocity that is to be sent is no standstill."""
         own = config.names(())
         send: Callable[[bytes], object] = nowhere
         heard: Callable[[], bool] = _always
@@ -100,19 +98,18 @@ class Ros2Robot(RosRobot):
             def heard() -> bool:
                 return wheels.heard
 
-            def send(velocity: bytes) -> None:
-                goes = self._goes and not wheels.heard  # who begins to hear is to hear how the velocity begins, too
-                if wheels.put(encode(self._make(Twist())) if goes else velocity):
-                    self._told = True
-                    if goes:
-                        raise ConnectionError("the wheels are told to stand until their node listens and hears us")
-                elif self._told:  # then the loop goes on from standstill when they can be told again
+            def send(velocity: bytes) -> bool:
+                taken = wheels.put(velocity)
+                if not taken and self._told:  # then the loop goes on from standstill when they can be told again
                     raise ConnectionError(
                         wheels.refused or "the wheels cannot be told: our ROS 2 node is lost, or hangs"
                     )
+                self._told |= taken
+                return taken
 
         readings: dict[str, type[Message]] = {name: type_of(kind) for name, kind in config.readings.items()}
-        self.base = GraphBase(readings, self.encoding, send, make=self._noted, idle_s=config.idle_s, heard=heard)
+        make = self._stamped if config.cmd_vel_type == TwistStamped.TYPE else _as_it_is
+        self.base = GraphBase(readings, self.encoding, send, make=make, idle_s=config.idle_s, heard=heard)
         for name, cls in readings.items():
             endpoint = self._endpoint(Kind.SUBSCRIPTION, own.own(name), cls.TYPE)
             reading = node.subscribe(endpoint, partial(self.base.put, name))
@@ -170,13 +167,7 @@ class Ros2Robot(RosRobot):
         if isinstance(self._clock, GraphClock):
             self._clock.close()
 
-    def _noted(self, twist: Twist) -> Message:
-        self._goes = twist != Twist()
-        return self._make(twist)
-
-    def _make(self, twist: Twist) -> Message:
-        if self._config.cmd_vel_type == Twist.TYPE:
-            return twist
+    def _stamped(self, twist: Twist) -> TwistStamped:
         return TwistStamped(Header(Time.from_seconds(self._clock()), self._config.frame), twist)
 
     def _types(self, names: Sequence[str]) -> dict[str, str]:
@@ -187,6 +178,10 @@ class Ros2Robot(RosRobot):
         # A reading takes what there is, reliable or not; wheels that ask for reliable get that.
         qos = Qos(reliable=kind is Kind.PUBLISHER, depth=1)
         return Endpoint(kind, name, type_name, hash_of(type_name, "cdr"), qos)
+
+
+def _as_it_is(twist: Twist) -> Message:
+    return twist
 
 
 def _always() -> bool:
