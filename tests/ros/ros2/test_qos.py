@@ -27,6 +27,12 @@ def test_what_all_of_them_offer_is_asked_for(offers, asked):
     assert not any(clash(offer, asked) for offer in offers)
 
 
+def test_what_is_kept_may_be_left_unless_the_row_asks_for_it():
+    """An old velocity is worse than none."""
+    assert follow(Qos(depth=1), [LATCHED], kept_too=False) == Qos(True, False, 10)
+    assert follow(LATCHED, [LATCHED], kept_too=False) == Qos(True, True, 10)
+
+
 def test_a_row_that_keeps_more_is_given_more():
     assert follow(Qos(depth=200), [SENSOR]).depth == 200
 

@@ -56,17 +56,18 @@ MIN_FOLLOWED, MAX_FOLLOWED = 10, 1000
 """Messages that a subscription keeps, whatever is offered; most kinds of DDS do not tell a publisher's depth."""
 
 
-def follow(row: Qos, offers: Collection[Qos]) -> Qos:
+def follow(row: Qos, offers: Collection[Qos], *, kept_too: bool = True) -> Qos:
     """What to ask for where publishers offer these: all that each of them offers, so that each is heard.
 
     Args:
         row: What the bridge's table asks for; of it the depth counts.
         offers: Of the publishers there are, one at least.
+        kept_too: Take also what they keep for newcomers; else only if the table asks for it.
     """
     depth = max(row.depth, sum(offer.depth or MIN_FOLLOWED for offer in offers))
     return Qos(
         reliable=all(offer.reliable for offer in offers),
-        transient_local=all(offer.transient_local for offer in offers),
+        transient_local=all(offer.transient_local for offer in offers) and (kept_too or row.transient_local),
         depth=min(max(depth, MIN_FOLLOWED), MAX_FOLLOWED),
     )
 

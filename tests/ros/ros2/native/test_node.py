@@ -25,6 +25,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.ros2]
 
 TWIST, STRING = Twist.TYPE, "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
+RESENT_S = 5.0
+"""DDS has sent again what somebody missed who goes on, a heartbeat of 3 s."""
 FAST = Twist(linear=Vector3(x=1.5))
 
 
@@ -305,6 +307,46 @@ node.create_subscription(Twist, "/bot/cmd_vel", lambda m: say(m.linear.x), 100)
     os.kill(ours.pid, signal.SIGKILL)
     until(lambda: wheels.passed + wheels.dropped == puts, "what waited in a program that ended to be counted")
     assert wheels.passed == before + 1
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_velocities_that_a_program_missed_while_it_hung_are_not_taken_later(ros2_nodes, ours, kept):
+    """A reliable publisher sends again what was not acknowledged, and DDS gives a newcomer what it keeps."""
+    peer = ros2_nodes.start(
+        f"""
+from geometry_msgs.msg import Twist
+wheels = node.create_publisher(Twist, "/cmd_vel", qos(latched={kept}))
+def work():
+    number = 0.0
+    for line in sys.stdin:
+        for _ in range(int(line)):
+            message = Twist()
+            message.linear.x = number = number + 1.0
+            wheels.publish(message)
+            time.sleep(0.02)
+        say(number)
+threading.Thread(target=work, daemon=True).start()
+"""
+    )
+
+    def publish(count):
+        peer.tell(str(count))
+        return peer.next()
+
+    got = []
+    cmd_vel = ours.subscribe(subscription("/cmd_vel"), lambda m: got.append(decode(Twist, m, "cdr").linear.x))
+    until(lambda: publish(5) and got, "a velocity")
+    os.kill(ours.pid, signal.SIGSTOP)
+    last = publish(50)
+    time.sleep(1.0)
+    os.kill(ours.pid, signal.SIGCONT)
+    time.sleep(RESENT_S)
+    first = last - 50 + 1
+    assert not [v for v in got if first <= v <= last]
+    until(lambda: publish(5) and got[-1] > last, "velocities again")
+    if cmd_vel.dropped:  # DDS does not always tell
+        until(lambda: ours.said, "a word on that")
+        assert ours.said == ["/cmd_vel: our end, or its program, stood still; what came meanwhile is not taken"]
 
 
 @pytest.mark.parametrize("more", [{}, {"depth": 10}, {"reliable": True, "lifespan": 0.1}])

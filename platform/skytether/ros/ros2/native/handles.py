@@ -16,9 +16,10 @@ from typing import Protocol
 
 from skytether.bridge.calls import CallError
 
+from ...velocities import VELOCITIES
 from ..dialect import Endpoint
 from ..qos import Qos, follow
-from .overrun import Overrun
+from .overrun import QUIET_S, Overrun
 from .side.frames import Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
 from .side.outbox import Sender
 
@@ -242,6 +243,8 @@ class Subscription(Handle):
         self._on_message = take
         self._lose = lose
         self._lost = 0
+        self._stale_at = -inf
+        """When the last message came that had waited for one of our processes that stood still [s]."""
         self._overrun = Overrun(endpoint.qos.depth)
         self._asked: Qos | None = None
 
@@ -252,7 +255,8 @@ class Subscription(Handle):
 
     def review(self, others: Collection[Endpoint]) -> None:
         offers = [other.qos for other in others]
-        wanted = follow(self.endpoint.qos, offers) if offers else None
+        kept_too = self.endpoint.type not in VELOCITIES  # of any age
+        wanted = follow(self.endpoint.qos, offers, kept_too=kept_too) if offers else None
         sender = self._sender
         if sender is None or wanted is None or wanted == self._asked:
             return
@@ -280,7 +284,7 @@ class Subscription(Handle):
         if frame.kind is Kind.FRESH:
             _, until, _, body = pull_fresh(body)
             if _now() > until:  # this process stood still
-                self.lose(1)
+                self.discard(1)
                 return
         self.passed += 1
         try:
@@ -293,6 +297,19 @@ class Subscription(Handle):
         self._lost += count
         if self._lose is not None:
             self._lose(count)
+
+    def discard(self, count: int) -> None:
+        """In the node's thread: so many more messages are not taken, for a process of ours stood still."""
+        self.dropped += count
+        self._stale_at = _now()
+        if self._lose is not None:
+            self._lose(count)
+
+    def stood_still(self) -> str:
+        """A sentence if messages were not taken because of that; empty if not, or a while ago."""
+        if _now() - self._stale_at > QUIET_S:
+            return ""
+        return f"{self.endpoint.name}: our end, or its program, stood still; what came meanwhile is not taken"
 
     def overrun(self, now: float) -> str:
         """A sentence if messages come quicker than they are taken; empty if not, or not any more. ``now`` in s."""

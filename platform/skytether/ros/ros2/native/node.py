@@ -84,7 +84,8 @@ class RclpyNode(NodeBase):
         self._channels = itertools.count(1)
         self._sender: Sender | None = None
         self._link: socket.socket | None = None
-        self._lost: dict[int, int] = {}
+        self._lost: dict[int, tuple[int, int]] = {}
+        """By channel: messages that the program lost, and those that it did not take for they had waited."""
         self.nodes = 0
         """Other nodes of the graph."""
         self.middleware = ""
@@ -167,7 +168,8 @@ class RclpyNode(NodeBase):
             if self._sender is not None:
                 self._sender.put(control(do="close", channel=handle.channel))
                 self._sender.remove(handle.channel)
-        self.settle(f"overrun {handle.channel}")
+        for what in ("overrun", "stale"):
+            self.settle(f"{what} {handle.channel}")
 
     # --- the program -------------------------------------------------------------------------------------------------
 
@@ -323,8 +325,8 @@ class RclpyNode(NodeBase):
                 for handle in handles:
                     self._review(handle)
             for handle in handles:
-                dropped, lost = told["lost"].get(str(handle.channel), (0, 0))
-                self._count(handle, dropped, lost)
+                lost, stale = told["lost"].get(str(handle.channel), (0, 0))
+                self._count(handle, lost, stale)
         if told["same"]:
             name = f"{self._name.namespace.rstrip('/')}/{self._name.name}"
             self.report(
@@ -347,23 +349,24 @@ class RclpyNode(NodeBase):
         self._troubles.keep(ours.name, sentences)
         handle.review([other for other in others if other.type == ours.type])
 
-    def _count(self, handle: Handle, dropped: int, lost: int) -> None:
-        """What the program could not give on, and what it lost because it was too slow."""
-        new = dropped + lost - self._lost.get(handle.channel, 0)
-        if new <= 0:
-            return
-        self._lost[handle.channel] = dropped + lost
-        handle.lose(new)
+    def _count(self, handle: Handle, lost: int, stale: int) -> None:
+        """What the program lost because somebody was too slow, and what it did not take because it had waited."""
+        lost_before, stale_before = self._lost.get(handle.channel, (0, 0))
+        self._lost[handle.channel] = lost, stale
+        if lost > lost_before:
+            handle.lose(lost - lost_before)
+        if isinstance(handle, Subscription) and stale > stale_before:
+            handle.discard(stale - stale_before)
 
     def _check_queues(self, now: float) -> None:
         with self._lock:
             subscriptions = [handle for handle in self._handles.values() if isinstance(handle, Subscription)]
         for handle in subscriptions:
-            key, sentence = f"overrun {handle.channel}", handle.overrun(now)
-            if sentence:
-                self.report(key, sentence)
-            else:
-                self.settle(key)
+            for what, sentence in (("overrun", handle.overrun(now)), ("stale", handle.stood_still())):
+                if sentence:
+                    self.report(f"{what} {handle.channel}", sentence)
+                else:
+                    self.settle(f"{what} {handle.channel}")
 
 
 def clashes(ours: Endpoint, others: Sequence[Endpoint]) -> list[str]:

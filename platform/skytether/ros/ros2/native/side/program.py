@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from inspect import signature
+from math import inf
 from typing import Any
 
 import rclpy
@@ -21,6 +22,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.utilities import get_rmw_implementation_identifier
 
 try:
@@ -65,12 +67,16 @@ STOOD_S = 0.3
 """Without a turn: this process stood still, and what waited for it is old."""
 DRAINED_S = 0.2
 """For what waited meanwhile to come; no velocity is taken until then."""
+SENT_AGAIN_S = 4.0
+"""After that a reliable publisher has sent again what this process missed: DDS asks each 3 s what somebody has."""
 _TURN_S = 0.05
 HEARS_S = 3.0
 """For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
 FAREWELL_S = 0.3
 """For the last messages to reach who listens."""
 _AT_ONCE = Duration()
+_TELLS_TIMES = hasattr(Subscription, "CallbackType")
+"""Whether this `rclpy` says of a message when it was published."""
 
 
 class _Server:
@@ -152,6 +158,12 @@ class Program:
         self._clients: dict[int, Any] = {}
         self._pending: dict[tuple[int, int], Any] = {}
         self._lost: dict[int, int] = {}
+        self._stale: dict[int, int] = {}
+        """What came while this process stood still, and was not taken."""
+        self._took: dict[int, float] = {}
+        """By topic: how long the last velocity took that was taken, by its publisher's clock and ours [s]."""
+        self._came: dict[int, tuple[float, float]] = {}
+        """When the last two velocities came [s]."""
         self._all: list[list[Any]] = []
         self._unnamed: dict[str, float] = {}
         self._send(
@@ -328,22 +340,29 @@ class Program:
         self._sender.set(channel, priority, keep)
 
         def put(message: bytes) -> None:
-            if kind in VELOCITIES and self._has_stood_still():
-                self._lost[channel] = self._lost.get(channel, 0) + 1
-            elif kind in VELOCITIES:
-                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
+            self._sender.put(Frame(Kind.DATA, channel, message))
+
+        def put_velocity(message: bytes, info: Any) -> None:
+            old = self._is_old(channel, info)
+            self._came[channel] = self._came.get(channel, (0.0, 0.0))[1], _now()
+            if old:
+                self._stale[channel] = self._stale.get(channel, 0) + 1
             else:
-                self._sender.put(Frame(Kind.DATA, channel, message))
+                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
 
         if kind in VELOCITIES and not self._turned:
             self._turned = _now()
             threading.Thread(target=self._turn, daemon=True).start()
         before = self._subscriptions.pop(channel, None)
         cls, qos = types.load(kind), graph.profile(reliable, transient_local, depth)
+        take: Callable[..., object] = put
+        if kind in VELOCITIES:
+            take = put_velocity if _TELLS_TIMES else lambda message: put_velocity(message, {"source_timestamp": 0})
+        events = self._events(channel)
         try:
-            new = self._node.create_subscription(cls, name, put, qos, raw=True, event_callbacks=self._events(channel))
+            new = self._node.create_subscription(cls, name, take, qos, raw=True, event_callbacks=events)
         except Exception:  # this middleware does not tell of lost messages
-            new = self._node.create_subscription(cls, name, put, qos, raw=True)
+            new = self._node.create_subscription(cls, name, take, qos, raw=True)
         self._subscriptions[channel] = new
         if before is not None:
             self._node.destroy_subscription(before)
@@ -353,6 +372,22 @@ class Program:
             self._has_stood_still()
             self._turned = _now()
             time.sleep(_TURN_S)
+
+    def _is_old(self, channel: int, info: Any) -> bool:
+        """Whether a velocity waited for this process, which stood still, or is sent again because it did.
+
+        Whoever publishes may have another clock: it is old if it took longer than the one before.
+        """
+        if self._has_stood_still():
+            return True
+        if not info["source_timestamp"]:  # it is not told
+            return False
+        took = time.time() - info["source_timestamp"] / 1e9
+        usual = self._took.setdefault(channel, took)
+        if _now() - self._went_on < SENT_AGAIN_S and took - usual > STOOD_S:
+            return True
+        self._took[channel] = took
+        return False
 
     def _has_stood_still(self) -> bool:
         """Whether this process did a moment ago, so that what comes may have waited for it."""
@@ -433,10 +468,13 @@ class Program:
     # --- of the graph ------------------------------------------------------------------------------------------------
 
     def _events(self, channel: int) -> SubscriptionEventCallbacks:
-        """Count what a subscription loses because we take it too slowly."""
+        """Count what a subscription loses because we take it too slowly, or not at all for a while."""
 
         def lost(event: Any) -> None:
-            self._lost[channel] = self._lost.get(channel, 0) + event.total_count_change
+            # DDS tells it with the first message after those that were lost, be that long after this process went on.
+            before, _ = self._came.get(channel, (inf, inf))
+            counted = self._stale if self._went_on > before else self._lost
+            counted[channel] = counted.get(channel, 0) + event.total_count_change
 
         callbacks = SubscriptionEventCallbacks(use_default_callbacks=False)
         callbacks.message_lost = lost
@@ -474,7 +512,8 @@ class Program:
         nodes, same = graph.others(self._node)
         # Of a publisher only answers wait here, the newest of which says all.
         dropped = {c: n for c, n in self._sender.dropped().items() if c not in self._publishers}
-        lost = {c: [dropped.get(c, 0), self._lost.get(c, 0)] for c in {*dropped, *self._lost}}
+        missed = {*dropped, *self._lost, *self._stale}
+        lost = {c: [dropped.get(c, 0) + self._lost.get(c, 0), self._stale.get(c, 0)] for c in missed}
         news = {"what": "graph", "endpoints": endpoints, "nodes": nodes, "same": same, "lost": lost}
         sim_time = self._node.get_parameter_or("use_sim_time").value is True
         return {**news, "sim_time": sim_time, "log_level": int(self._node.get_logger().get_effective_level())}
