@@ -368,6 +368,14 @@ def test_a_sensor_that_raises_brakes_the_wheels_and_is_logged_once(driven, caplo
     driven.base.on_read = lambda: None
     driven.run(1.5, linear=0.2)
     assert driven.base.velocity[0] == pytest.approx(0.2)
+    driven.base.on_read = fail
+    driven.run(0.3, linear=0.2)
+    assert len([record for record in caplog.records if "control failed" in record.message]) == 1
+    driven.base.on_read = lambda: None
+    driven.run(31.0, linear=0.2)
+    driven.base.on_read = fail
+    driven.run(0.3, linear=0.2)
+    assert len([record for record in caplog.records if "control failed" in record.message]) == 2, "a while later anew"
 
 
 def test_a_fallback_that_raises_brakes_the_wheels(base, make_cloud):

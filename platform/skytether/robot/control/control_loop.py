@@ -56,6 +56,8 @@ _TICK_S = 0.5
 """No tick takes longer than this: a command that came later than that after its begin is not from this clock."""
 _SETTLE_S = 0.2
 """After a stall, how long readings are not used [s]: those from before it wait in sockets, and are read first."""
+_QUIET_S = 30.0
+"""Without an error of a part, the next one is logged again [s]."""
 _TRANSITIONS_KEPT = 1000
 """The newest; all are counted."""
 
@@ -151,6 +153,7 @@ class ControlLoop:
         self._commands = self._missed_commands = 0
         self._objections: Counter[str] = Counter()
         self._errors: Counter[str] = Counter()
+        self._failed_at: dict[str, float] = {}
         self._read: Counter[str] = Counter()
         self._first_command_at: float | None = None
         self._clocks = clocks
@@ -434,11 +437,12 @@ class ControlLoop:
             self._caught("write", error)
 
     def _caught(self, part: str, error: Exception) -> None:
-        """Count always; log the first of each part, with its trace if its sentence may not say all."""
+        """Count always; log the first of each part in a while, with its trace if its sentence may not say all."""
         self._errors[part] += 1
-        if self._errors[part] == 1:
+        if self._now - self._failed_at.get(part, -inf) > _QUIET_S:
             trace = None if isinstance(error, ConnectionError) else error
-            _log.error("%s failed, further ones are counted only: %s", part, error, exc_info=trace)
+            _log.error("%s failed, more within %g s are counted only: %s", part, _QUIET_S, error, exc_info=trace)
+        self._failed_at[part] = self._now
 
 
 def _command(epoch: int, message: MessageReceived, encoding: Encoding) -> Command:
