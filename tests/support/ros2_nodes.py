@@ -70,7 +70,8 @@ class Node:
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self._said.put(json.loads(line))
+            if line.endswith("\n"):  # or it was killed while it said so
+                self._said.put(json.loads(line))
         self._said.put(EOFError("the node has ended"))
 
     def next(self, limit_s: float = LIMIT_S) -> Any:

@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable
 from inspect import signature
-from math import inf
 from typing import Any
 
 import rclpy
@@ -44,7 +43,9 @@ from .frames import (
     pull_number,
     push_head,
 )
+from .hearing import Hearing
 from .outbox import FIRST, Sender
+from .stalls import STOOD_S, TURN_S, Stalls
 
 LOOK_S = 0.2
 """Between two looks at the topics that the agent has something to do with."""
@@ -59,19 +60,8 @@ MAX_ASKED = 64
 """Calls of one service that wait for the agent; who comes then is not answered."""
 NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
-SILENT_S = 0.5
-"""Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 VELOCITIES = {"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"}
 """Late, they are worse than none: whoever has them drives on."""
-STOOD_S = 0.3
-"""Without a turn: this process stood still, and what waited for it is old."""
-DRAINED_S = 0.2
-"""For what waited meanwhile to come; no velocity is taken until then."""
-SENT_AGAIN_S = 4.0
-"""After that a reliable publisher has sent again what this process missed: DDS asks each 3 s what somebody has."""
-_TURN_S = 0.05
-HEARS_S = 3.0
-"""For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
 FAREWELL_S = 0.3
 """For the last messages to reach who listens."""
 _AT_ONCE = Duration()
@@ -138,21 +128,9 @@ class Program:
         self._published: dict[int, int] = {}
         """Of those that are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
-        self._read_at: dict[int, float] = {}
-        """When all that was published had been acknowledged last, where it was at some time [s]."""
-        self._unread: dict[int, float] = {}
-        """For how long it had not been, when a message was published last [s]."""
-        self._listened: dict[int, float] = {}
-        """Since when somebody listens to what was published [s]."""
-        self._heard: set[int] = set()
-        """What somebody listens to, and is known to hear."""
-        self._listeners: dict[int, int] = {}
-        """How many listened to that, when a message was published last."""
-        self._left: set[int] = set()
-        """What somebody listened to who does not any more, while others do."""
-        self._turned = 0.0
-        """When this process was seen to run last, while it takes velocities, and when it went on [s]."""
-        self._went_on = 0.0
+        self._hearing: dict[int, Hearing] = {}
+        self._stalls: Stalls | None = None
+        """Watched while velocities are taken."""
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -160,10 +138,6 @@ class Program:
         self._lost: dict[int, int] = {}
         self._stale: dict[int, int] = {}
         """What came while this process stood still, and was not taken."""
-        self._took: dict[int, float] = {}
-        """By topic: how long the last velocity took that was taken, by its publisher's clock and ours [s]."""
-        self._came: dict[int, tuple[float, float]] = {}
-        """When the last two velocities came [s]."""
         self._all: list[list[Any]] = []
         self._unnamed: dict[str, float] = {}
         self._send(
@@ -245,17 +219,16 @@ class Program:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
             number, until, heeds, body = pull_fresh(frame.body)
-            publisher, unread_s, heard = self._publishers.get(frame.channel), 0.0, False
+            publisher, hearing = self._publishers.get(frame.channel), self._hearing.get(frame.channel, Hearing())
             if publisher is not None:
-                unread_s = self._unread_s(frame.channel, publisher)
-                heard = frame.channel in self._heard
-                if _now() <= until and (heard or not heeds):  # or he is new, and it is no first word for him
+                read = _has_been_read(publisher)
+                hearing.update(publisher.get_subscription_count(), read, _now())
+                if _now() <= until and (hearing.heard or not heeds):  # or he is new, and it is no first word for him
                     publisher.publish(body)
                     self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
-                    if publisher.get_subscription_count():
-                        self._listened.setdefault(frame.channel, _now())
+                    hearing.tell(publisher.get_subscription_count(), _now())
             published = self._published.get(frame.channel, 0)
-            self._sender.put(dealt_with(frame.channel, number, unread_s, published, heard))
+            self._sender.put(dealt_with(frame.channel, number, hearing.unread_s, published, hearing.heard))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -272,37 +245,6 @@ class Program:
             else:
                 server.leave(number)
 
-    def _unread_s(self, channel: int, publisher: Any) -> float:
-        """For how long somebody who listens, and did, has not acknowledged what was published [s].
-
-        Who always takes longer for that than it takes until the next message is not known by it, and never counts.
-        """
-        now = _now()
-        try:
-            read = publisher.wait_for_all_acked(_AT_ONCE)
-        except Exception:  # this middleware does not tell
-            read = True
-        listened = publisher.get_subscription_count()
-        before, self._listeners[channel] = self._listeners.get(channel, 0), listened
-        if not listened:
-            self._listened.pop(channel, None)
-            self._heard.discard(channel)
-            self._left.discard(channel)
-        elif listened < before:
-            self._left.add(channel)
-        elif listened > before and (channel in self._left or self._unread.get(channel, 0.0) > SILENT_S):
-            self._left.discard(channel)  # the wheels' node may have been started again, beside a recorder
-            self._listened[channel] = now
-            self._heard.discard(channel)
-        elif channel in self._listened and (read or now - self._listened[channel] > HEARS_S):
-            self._heard.add(channel)
-        if read and listened:
-            self._read_at[channel] = now
-        elif read:
-            self._read_at.pop(channel, None)
-        self._unread[channel] = now - self._read_at.get(channel, now)
-        return self._unread[channel]
-
     def _do_publish(
         self,
         channel: int,
@@ -318,6 +260,7 @@ class Program:
         self._sender.set(channel, FIRST, 1)
         qos = graph.profile(reliable, transient_local, depth)
         self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
+        self._hearing[channel] = Hearing()
         if farewell:
             self._farewells[channel] = base64.b64decode(farewell), farewell_after_s
 
@@ -342,22 +285,11 @@ class Program:
         def put(message: bytes) -> None:
             self._sender.put(Frame(Kind.DATA, channel, message))
 
-        def put_velocity(message: bytes, info: Any) -> None:
-            old = self._is_old(channel, info)
-            self._came[channel] = self._came.get(channel, (0.0, 0.0))[1], _now()
-            if old:
-                self._stale[channel] = self._stale.get(channel, 0) + 1
-            else:
-                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
-
-        if kind in VELOCITIES and not self._turned:
-            self._turned = _now()
-            threading.Thread(target=self._turn, daemon=True).start()
-        before = self._subscriptions.pop(channel, None)
-        cls, qos = types.load(kind), graph.profile(reliable, transient_local, depth)
         take: Callable[..., object] = put
         if kind in VELOCITIES:
-            take = put_velocity if _TELLS_TIMES else lambda message: put_velocity(message, {"source_timestamp": 0})
+            take = self._taker_of_velocities(channel)
+        before = self._subscriptions.pop(channel, None)
+        cls, qos = types.load(kind), graph.profile(reliable, transient_local, depth)
         events = self._events(channel)
         try:
             new = self._node.create_subscription(cls, name, take, qos, raw=True, event_callbacks=events)
@@ -367,34 +299,25 @@ class Program:
         if before is not None:
             self._node.destroy_subscription(before)
 
-    def _turn(self) -> None:
-        while not self._ended.is_set():
-            self._has_stood_still()
-            self._turned = _now()
-            time.sleep(_TURN_S)
+    def _taker_of_velocities(self, channel: int) -> Callable[..., object]:
+        """What `rclpy` calls with each."""
+        if self._stalls is None:
+            self._stalls = Stalls(_now())
+            threading.Thread(target=self._turn, args=(self._stalls,), daemon=True).start()
+        stalls = self._stalls
 
-    def _is_old(self, channel: int, info: Any) -> bool:
-        """Whether a velocity waited for this process, which stood still, or is sent again because it did.
+        def take(message: bytes, info: Any) -> None:
+            sent = info["source_timestamp"]  # in ns; 0 where it is not told
+            if stalls.is_old(channel, time.time() - sent / 1e9 if sent else None, _now()):
+                self._stale[channel] = self._stale.get(channel, 0) + 1
+            else:
+                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
 
-        Whoever publishes may have another clock: it is old if it took longer than the one before.
-        """
-        if self._has_stood_still():
-            return True
-        if not info["source_timestamp"]:  # it is not told
-            return False
-        took = time.time() - info["source_timestamp"] / 1e9
-        usual = self._took.setdefault(channel, took)
-        if _now() - self._went_on < SENT_AGAIN_S and took - usual > STOOD_S:
-            return True
-        self._took[channel] = took
-        return False
+        return take if _TELLS_TIMES else lambda message: take(message, {"source_timestamp": 0})
 
-    def _has_stood_still(self) -> bool:
-        """Whether this process did a moment ago, so that what comes may have waited for it."""
-        now = _now()
-        if now - self._turned > STOOD_S:
-            self._went_on = now
-        return now - self._went_on < DRAINED_S
+    def _turn(self, stalls: Stalls) -> None:
+        while not self._ended.wait(TURN_S):
+            stalls.turn(_now())
 
     def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
         self._names[channel] = name
@@ -414,12 +337,7 @@ class Program:
     def _do_close(self, channel: int) -> None:
         self._names.pop(channel, None)
         self._farewells.pop(channel, None)
-        self._read_at.pop(channel, None)
-        self._unread.pop(channel, None)
-        self._listened.pop(channel, None)
-        self._listeners.pop(channel, None)
-        self._heard.discard(channel)
-        self._left.discard(channel)
+        self._hearing.pop(channel, None)
         server = self._servers.pop(channel, None)
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
@@ -471,9 +389,8 @@ class Program:
         """Count what a subscription loses because we take it too slowly, or not at all for a while."""
 
         def lost(event: Any) -> None:
-            # DDS tells it with the first message after those that were lost, be that long after this process went on.
-            before, _ = self._came.get(channel, (inf, inf))
-            counted = self._stale if self._went_on > before else self._lost
+            stood = self._stalls is not None and self._stalls.explains(channel)
+            counted = self._stale if stood else self._lost
             counted[channel] = counted.get(channel, 0) + event.total_count_change
 
         callbacks = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -529,6 +446,14 @@ class Program:
         unnamed = {e[0] for e in endpoints if not e[5]}
         self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
         return [e for e in endpoints if e[5] or now - self._unnamed[e[0]] >= NAMED_S]
+
+
+def _has_been_read(publisher: Any) -> bool:
+    """Whether all who listen have acknowledged all."""
+    try:
+        return bool(publisher.wait_for_all_acked(_AT_ONCE))
+    except Exception:  # this middleware does not tell
+        return True
 
 
 def _now() -> float:

@@ -1,0 +1,57 @@
+"""Whether whoever listens to a publisher hears it, by what DDS says was acknowledged. Pure."""
+
+from __future__ import annotations
+
+SILENT_S = 0.5
+"""Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
+HEARS_S = 3.0
+"""For who listens to acknowledge a first message; then it counts as heard: one who hangs must not hold the robot."""
+
+
+class Hearing:
+    """Of one publisher.
+
+    Attributes:
+        heard: Whether somebody listens, and is known to hear.
+        unread_s: For how long somebody who listens, and did, has not acknowledged what was published [s].
+    """
+
+    def __init__(self) -> None:
+        self.heard = False
+        self.unread_s = 0.0
+        self._read_at: float | None = None
+        """When all had been acknowledged last, where it was at some time [s]."""
+        self._told_since: float | None = None
+        """Since when somebody listens to what was published [s]."""
+        self._listeners = 0
+        self._left = False
+        """Whether somebody listened who does not any more, while others do."""
+
+    def update(self, listeners: int, read: bool, now: float) -> None:
+        """A message is about to be published.
+
+        Who always takes longer to acknowledge one than it takes until the next is not known by it, and never counts.
+
+        Args:
+            listeners: How many there are.
+            read: Whether they have acknowledged all that was published.
+            now: Seconds.
+        """
+        before, self._listeners = self._listeners, listeners
+        if not listeners:
+            self.heard, self._told_since, self._left = False, None, False
+        elif listeners < before:
+            self._left = True
+        elif listeners > before and (self._left or self.unread_s > SILENT_S):
+            # The wheels' node may have been started again, beside a recorder.
+            self.heard, self._told_since, self._left = False, now, False
+        elif self._told_since is not None and (read or now - self._told_since > HEARS_S):
+            self.heard = True
+        if read:
+            self._read_at = now if listeners else None
+        self.unread_s = 0.0 if self._read_at is None else now - self._read_at
+
+    def tell(self, listeners: int, now: float) -> None:
+        """A message was published, with so many who listen."""
+        if listeners and self._told_since is None:
+            self._told_since = now
