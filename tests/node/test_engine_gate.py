@@ -201,7 +201,7 @@ def tar(*entries: tuple[str, bytes, str | bytes], form: int = tarfile.USTAR_FORM
 
 
 FOLDER, FILE, LINK = tarfile.DIRTYPE, tarfile.REGTYPE, tarfile.SYMTYPE
-GRANT = (("instance", FOLDER, b""), ("data", FOLDER, b""), ("data/i-1", FOLDER, b""))
+GRANT = (("instance", FOLDER, b""),)
 
 
 def test_an_archive_with_a_grant_is_passed_on_as_it_is(engine: Engine) -> None:
@@ -209,6 +209,18 @@ def test_an_archive_with_a_grant_is_passed_on_as_it_is(engine: Engine) -> None:
     assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive))
     line, _, got = engine.asked[-1]
     assert (line, got) == (f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
+    data = tar(("i-1", FOLDER, b""))
+    assert b"200 OK" in say(engine, request(f"PUT /containers/{ID}/archive?path=%2Fvar%2Flib%2Fskytether", data))
+
+
+@pytest.mark.parametrize(
+    "entry", [("../i-1", FOLDER, b""), ("a/b", FOLDER, b""), (".", FOLDER, b""), ("a", LINK, "/"), ("a", FILE, b"a")]
+)
+def test_a_folder_for_data_is_all_that_is_put_where_others_write_too(engine: Engine, entry: Any) -> None:
+    for archive in (tar(entry), tar(("instance/grant.json", FILE, b"a"))):
+        sent = request(f"PUT /containers/{ID}/archive?path=%2Fvar%2Flib%2Fskytether", archive)
+        assert b"something else than folders of ours and a grant" in say(engine, sent)
+    assert not any(line.startswith("PUT") for line in engine.lines)
 
 
 @pytest.mark.parametrize(
@@ -220,8 +232,8 @@ def test_an_archive_with_a_grant_is_passed_on_as_it_is(engine: Engine) -> None:
         tar(("instance/grant.json", tarfile.LNKTYPE, "data")),
         tar(("instance/grant.json", tarfile.FIFOTYPE, b"")),
         tar(("instance/grant.json", tarfile.CHRTYPE, b"")),
-        tar(("data/../../etc", FOLDER, b"")),
-        tar(("data/..", FOLDER, b"")),
+        tar(("i-1", FOLDER, b"")),
+        tar(("instance/..", FOLDER, b"")),
         tar(("/instance", FOLDER, b"")),
         tar(("instance/other", FILE, b"a")),
         tar(("instance/grant.json", FILE, b"a"), form=tarfile.PAX_FORMAT, pax_headers={"path": "a"}),
@@ -230,7 +242,7 @@ def test_an_archive_with_a_grant_is_passed_on_as_it_is(engine: Engine) -> None:
         tar(*GRANT) + tar(("a", LINK, "/")),  # some look behind the end
         tar(*GRANT)[:1024] + b"a" * 512,
         tar(("instance/grant.json", FILE, b"a" * 2000))[:1500],
-        tar(*GRANT * 10),
+        tar(*GRANT * 20),
         gzip.compress(tar(*GRANT)),
         b"a" * 60_000,
     ],
@@ -470,7 +482,7 @@ def test_no_pull_takes_the_name_of_an_image_that_is_from_elsewhere(
 
 MOUNTED = [
     {"Type": "volume", "Name": ID, "Destination": "/run/skytether"},
-    {"Type": "volume", "Name": "skytether-data", "Destination": "/run/skytether/data"},
+    {"Type": "volume", "Name": "skytether-data", "Destination": "/var/lib/skytether"},
 ]
 
 
@@ -486,10 +498,13 @@ def volume(path: str, name: str = ID) -> dict[str, str]:
         (MOUNTED, {"HostConfig": {"ReadonlyRootfs": False}}, set(), b"it may change its own files"),
         (MOUNTED, {"HostConfig": None}, set(), b"it may change its own files"),
         ([volume("/w"), volume("/w/a/b")], {}, set(), b"/w/a/b is in /w, where things can be moved"),
+        # Its own volume, of which it hands an open folder to a container that shares another one.
+        ([volume("/w"), volume("/w/a")], {}, set(), b"/w/a is in /w, where things can be moved"),
+        ([volume("/w"), volume("/w/a", "skytether-w")], {}, set(), b"/w/a is in /w, where things can be moved"),
         ([volume("/w", "skytether-w"), volume("/w/a")], {}, set(), b"/w/a is in /w, where things can be moved"),
         ([volume("/etc", "skytether-w")], {}, set(), b"/etc/hosts is in /etc, where things can be moved"),
         # What ran may leave a pipe there, of its own volume too: the next start waits for it for ever.
-        ([volume("/etc")], {}, set(), b"/etc/group is in a volume, where things can be moved"),
+        ([volume("/etc/group")], {}, set(), b"/etc/group is in a volume, where things can be moved"),
         ([volume("/etc/passwd")], {}, set(), b"/etc/passwd is in a volume"),
         ([volume("/etc/passwd.d"), volume("/etcetera")], {}, set(), b""),
         ([volume(f"/v{number}") for number in range(64)], {}, set(), b""),

@@ -18,9 +18,9 @@ from skytether.orchestrator.runtimes.docker.objects import (
     REPORTS,
     Declared,
     Namespace,
+    archives,
     container,
     epoch_volume,
-    grant_archive,
     guard,
     holder,
 )
@@ -99,8 +99,9 @@ def test_of_files_in_containers_those_are_passed_on_that_the_runtime_asks_for() 
     path = f"/v1.41/containers/{ID}/archive"
     for file in (READY, REPORTS):
         assert asked("HEAD", path, path=file) is asked("GET", path, path=file) is None
-    assert asked("PUT", path, path=grant_archive(launch())[0]) is None
-    assert cleaned(grant_archive(launch())[1]) == grant_archive(launch())[1]
+    for folder, archive in archives(launch()):
+        assert asked("PUT", path, path=folder) is None
+        assert cleaned(archive, folder) == archive
     for odd in ("/", "/etc/shadow", "/run/skytether/data/a", f"{READY}/..", ""):
         assert {"is no file" in str(asked(method, path, path=odd)) for method in ("HEAD", "GET", "PUT")} == {True}
     assert asked("GET", path)

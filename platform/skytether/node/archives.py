@@ -24,14 +24,13 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from .engine_rules import LOOK, NOBODY, OWNER
+from .engine_rules import DATA, FOLDER, LOOK, NOBODY, OWNER
 from .machine import ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
 _KERNEL = re.compile(r"/(?:dev|proc|sys)(?:/.*)?", re.DOTALL)
 """What an engine mounts in each container beside, and holds it by."""
-_ANONYMOUS = "[0-9a-f]{64}"
 _MOST_MOUNTS, _MOST_WAYS = 64, 512
 """Of a container, and folders on the ways to them: an engine mounts all of the first in the machine's own tree, which
 has room for some, whenever it looks into that container; the node asks for each of the second."""
@@ -45,15 +44,19 @@ _MOST_USERS = 1 << 20
 """Bytes in one of these."""
 _KNOWN = 4096
 _BLOCK = 512
-_FOLDERS, _GRANT = re.compile(r"instance|data(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80})?"), "instance/grant.json"
-"""What is put below `FOLDER`."""
+_FOLDERS = {FOLDER: re.compile("instance"), DATA: re.compile("[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80}")}
+"""Folders that are put in each."""
+_GRANT = "instance/grant.json"
+"""The file that is put below `FOLDER`."""
 _MOST_ENTRIES = 16
 _MOST_ID = 1 << 20
 """Of a user."""
 
 
-def cleaned(archive: bytes) -> bytes | None:
+def cleaned(archive: bytes, where: str) -> bytes | None:
     """An archive with the same folders and the same grant, and nothing else; None: there is something else in it.
+
+    ``where``: the folder that it is put in.
 
     Its heads are read one by one: what says of the next one how it is to be read is something else.
     """
@@ -68,9 +71,9 @@ def cleaned(archive: bytes) -> bytes | None:
             except (tarfile.TarError, ValueError):
                 return None
             made, content = tarfile.TarInfo(entry.name), b""
-            if entry.type == tarfile.REGTYPE and entry.name == _GRANT and entry.size >= 0:
+            if entry.type == tarfile.REGTYPE and (where, entry.name) == (FOLDER, _GRANT) and entry.size >= 0:
                 content = archive[place + _BLOCK : place + _BLOCK + entry.size]
-            elif entry.type != tarfile.DIRTYPE or not _FOLDERS.fullmatch(entry.name):
+            elif entry.type != tarfile.DIRTYPE or not _FOLDERS[where].fullmatch(entry.name):
                 return None
             if len(content) != entry.size or not (0 <= entry.uid < _MOST_ID and 0 <= entry.gid < _MOST_ID):
                 return None
@@ -89,11 +92,12 @@ def _ended(tar: tarfile.TarFile, buffer: io.BytesIO) -> bytes:
 def moved(inspected: Mapping[str, Any]) -> str | None:
     """Why the way to something in a container could be moved by what runs there or beside it; None: by nobody.
 
-    A mount right below a volume that is this container's alone is held by the kernel: nobody in there moves it.
+    What is in a volume could: a container has that alone, but may hand an open folder of it to another one, where no
+    mount holds what is in there.
     """
     if (inspected.get("HostConfig") or {}).get("ReadonlyRootfs") is not True:
         return "it may change its own files"
-    mounts = {str(one.get("Destination")): one for one in inspected.get("Mounts") or ()}
+    mounts = [str(one.get("Destination")) for one in inspected.get("Mounts") or ()]
     if len(mounts) > _MOST_MOUNTS or len(ways(inspected)) > _MOST_WAYS:
         return "it has too many mounts, or at paths that are too long"
     for path in (*mounts, *_FILES, *_in_memory(inspected)):
@@ -102,10 +106,8 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
             return f"{path or 'nothing'} is no whole path"
         if _KERNEL.fullmatch(path):
             return f"{path} is the kernel's"
-        for above, mount in mounts.items():
-            below = path.startswith(f"{above.rstrip('/')}/")
-            own = mount.get("Type") == "volume" and re.fullmatch(_ANONYMOUS, str(mount.get("Name")))
-            if below and not (own and posixpath.dirname(path) == above):
+        for above in mounts:
+            if path.startswith(f"{above.rstrip('/')}/"):
                 return f"{path} is in {above}, where things can be moved"
     # Nothing is mounted there that the kernel would hold: what ran could leave a pipe, for the next start.
     users = (path for path in sorted(_USERS) if any(path == one or path.startswith(f"{one}/") for one in mounts))

@@ -144,7 +144,7 @@ class EngineGate:
                 raise RefusedCall("its body is no JSON") from None
             await self._check(Call(method, unquote(path), query, said))
             if archive:
-                made = cleaned(body)
+                made = cleaned(body, query["path"])
                 if made is None:
                     raise RefusedCall("its archive has something else than folders of ours and a grant")
                 body = made

@@ -89,8 +89,9 @@ LOOK = f"{_OURS}look-"
 _BRIDGE = "skt-[0-9A-Za-z]{1,11}"
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
 _TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
-FOLDER = "/run/skytether"
-"""In containers: what is put there is for the service, and what it says of itself is in files in there."""
+FOLDER, DATA = "/run/skytether", "/var/lib/skytether"
+"""In containers: what is put into the first is for the service, and what it says of itself is in files in there; in the
+second a folder is put for what it writes."""
 _READ = {f"{FOLDER}/instance/{name}" for name in ("ready.json", FILE_NAME)}
 _TMPFS = re.compile(r"(?:(?:size|mode|uid|gid|nr_inodes)=[0-9]+[kmg]?|nosuid|nodev|noexec|exec|rw|ro)")
 """Options of a file system in memory. Others would not make one: ``remount`` makes ``/sys`` as it is writable, and
@@ -233,7 +234,7 @@ def _listed(call: Call) -> str | None:
 
 def _archive(call: Call) -> str | None:
     path = call.query.get("path")
-    known = path == FOLDER if call.method == "PUT" else path in _READ
+    known = path in (FOLDER, DATA) if call.method == "PUT" else path in _READ
     return None if known else f"{str(path)[:80]} is no file that a site asks for"
 
 

@@ -116,7 +116,7 @@ def test_what_has_begun_runs_on_when_its_orchestrator_ends_and_what_has_not_is_t
     job = scene.job()
     scene.meanwhile = job.leave
     ended(job)
-    assert scene.calls == ["create", "put", "start"], "the next leader may say of it already that it runs"
+    assert scene.calls == ["create", "put", "put", "start"], "the next leader may say of it already that it runs"
     assert not job.failure
 
     scene.calls.clear()
@@ -158,7 +158,7 @@ def test_an_orchestrator_that_ends_waits_for_its_starts_and_cancels_none(
     assert begins.wait(PATIENCE)
     runtime.close()
     assert was_over == [True], "or the network that its container has joined would seem to be nobody's"
-    assert scene.calls == ["create", "put", "start"]
+    assert scene.calls == ["create", "put", "put", "start"]
 
 
 @pytest.mark.parametrize("overtaken", [True, False])
@@ -171,7 +171,7 @@ def test_a_begin_without_an_answer_is_undone_only_by_who_leads(scene: Scene, ove
 
     scene.meanwhile = meanwhile
     job = ended(scene.job())
-    assert scene.calls == ["create", "put", "start"] + ["remove"] * (not overtaken)
+    assert scene.calls == ["create", "put", "put", "start"] + ["remove"] * (not overtaken)
     assert (job.unanswered, job.failure, job.given_up) == (True, "", set() if overtaken else {"c1"})
 
 
@@ -187,7 +187,7 @@ def test_an_end_that_was_asked_for_while_it_began_is_carried_out_only_by_who_lea
 
     scene.meanwhile = meanwhile
     ended(job)
-    assert scene.calls == ["create", "put", "start"] + ["kill KILL"] * (not overtaken)
+    assert scene.calls == ["create", "put", "put", "start"] + ["kill KILL"] * (not overtaken)
 
 
 @pytest.mark.parametrize("overtaken", [True, False])

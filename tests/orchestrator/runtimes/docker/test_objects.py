@@ -41,12 +41,12 @@ from skytether.orchestrator.runtimes.docker.objects import (
     Declared,
     Namespace,
     advised,
+    archives,
     container,
     data_volume,
     declared,
     free_gpus,
     free_port,
-    grant_archive,
     guard,
     holder,
     refusal,
@@ -93,6 +93,10 @@ def test_an_image_that_declares_thousands_of_volumes_is_not_started() -> None:
     with pytest.raises(RuntimeFailure, match="its image declares 33 volumes, and may declare 32"):
         declared("sha256:1", {"Config": {"Volumes": paths}})
     del paths["/v/0"]
+    with pytest.raises(RuntimeFailure, match="so that /run/skytether is in /run; none may be in another"):
+        declared("sha256:1", {"Config": {"Volumes": {"/run/": {}}}})
+    with pytest.raises(RuntimeFailure, match="so that /w/a/b is in /w; none may be in another"):
+        declared("sha256:1", {"Config": {"Volumes": {"/w": {}, "//w/../w/a/b": {}}}})
     mounts = body(image=declared("sha256:1", {"Config": {"Volumes": paths}}))["HostConfig"]["Mounts"]
     assert len(mounts) == 34
 
@@ -220,8 +224,11 @@ def test_a_signal_is_told_from_a_status_of_the_programs_own(code: int, status: i
 
 def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
     assert KEY not in json.dumps(body())
-    folder, archive = grant_archive(launch())
-    assert folder == "/run/skytether"
+    (folder, archive), (data, archive_of_data) = archives(launch())
+    assert (folder, data) == ("/run/skytether", "/var/lib/skytether")
+    assert KEY.encode() not in archive_of_data
+    with tarfile.open(fileobj=io.BytesIO(archive_of_data)) as tar:
+        assert [(entry.name, entry.mode, entry.uid) for entry in tar] == [("i1", 0o700, 65_532)]
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
         entries = {entry.name: entry for entry in tar}
         file = tar.extractfile("instance/grant.json")
@@ -231,7 +238,8 @@ def test_the_key_is_in_the_archive_and_nowhere_else() -> None:
     assert (grant.bind_host, grant.bind_port) == ("0.0.0.0", 7600)
     assert {entry.uid for entry in entries.values()} == {65_532}
     assert entries["instance/grant.json"].mode == 0o400
-    assert entries["instance"].mode == entries["data/i1"].mode == 0o700
+    assert entries["instance"].mode == 0o700
+    assert grant.data_dir == "/var/lib/skytether/i1"
 
 
 def test_published_and_advertised_addresses_are_two_things() -> None:

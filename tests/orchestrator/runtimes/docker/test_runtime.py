@@ -220,7 +220,7 @@ def writes(folder):
     except OSError as error:
         return error.strerror
     return ""
-print(json.dumps([writes(f) for f in ("/", "/app", "/run/skytether", "/tmp", "/run/skytether/data/i1")]))
+print(json.dumps([writes(f) for f in ("/", "/app", "/run/skytether", "/tmp", "/var/lib/skytether/i1")]))
 """,
     )
     assert tried == ["Read-only file system", "Read-only file system", "Permission denied", "", ""]
@@ -288,7 +288,7 @@ def test_what_it_writes_stays(docker_site: DockerSite, runtime: DockerRuntime) -
     runtime.start(launch(docker_site))
     until_phase(runtime, Phase.RUNNING)
     (container,) = docker_site.containers()
-    inside(container, "open('/run/skytether/data/i1/recording', 'w').write('kept'); print(1)")
+    inside(container, "open('/var/lib/skytether/i1/recording', 'w').write('kept'); print(1)")
     runtime.remove("i1")
     assert docker_site.containers() == []
     (volume,) = docker_site.volumes()
@@ -303,12 +303,12 @@ def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room
         runtime.start(launch(docker_site))
         until_phase(runtime, Phase.RUNNING)
         (container,) = docker_site.containers()
-        inside(container, "open('/run/skytether/data/i1/much', 'wb').write(bytes(3 << 20)); print(1)")
+        inside(container, "open('/var/lib/skytether/i1/much', 'wb').write(bytes(3 << 20)); print(1)")
         runtime.scales.weigh()
         assert "has more than 1 MiB in the volume" in runtime.observe()["i1"].exceeds
         with pytest.raises(RuntimeFailure, match="has more than 1 MiB"):
             runtime.start(launch(docker_site, "i2"))
-        inside(container, "import os; os.remove('/run/skytether/data/i1/much'); print(1)")
+        inside(container, "import os; os.remove('/var/lib/skytether/i1/much'); print(1)")
         runtime.scales.weigh()
         assert runtime.observe()["i1"].exceeds == ""
         inside(container, "open('/run/skytether/instance/much', 'wb').write(bytes(65 << 20)); print(1)")
@@ -334,7 +334,7 @@ def test_what_hides_from_being_weighed_is_ended(docker_site: DockerSite, tmp_pat
 
 _HIDE = """
 import os
-os.chdir("/run/skytether/data/i1")
+os.chdir("/var/lib/skytether/i1")
 open("much", "wb").write(bytes(3 << 20))
 for _ in range(30):
     os.mkdir("d" * 200)

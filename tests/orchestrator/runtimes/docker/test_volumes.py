@@ -174,7 +174,7 @@ def test_what_wrote_too_much_is_seen_so() -> None:
     assert observation(running, options).phase is Phase.RUNNING
     mounts = [
         {"Destination": "/run/skytether", "Name": "grant"},
-        {"Destination": "/run/skytether/data", "Name": "skytether-me-data-walker-toy"},
+        {"Destination": "/var/lib/skytether", "Name": "skytether-me-data-walker-toy"},
     ]
     described = {
         "Id": "c1",

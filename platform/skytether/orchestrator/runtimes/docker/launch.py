@@ -23,7 +23,7 @@ from .follow import Follower
 from .images import ensure_image
 from .namespaces import Namespaces
 from .network import close_off, guard_image, is_ours
-from .objects import OWNER, Namespace, advised, container, declared, free_gpus, free_port, grant_archive, name_of
+from .objects import OWNER, Namespace, advised, archives, container, declared, free_gpus, free_port, name_of
 from .options import DockerOptions
 from .seen import ContainerState, parse
 
@@ -339,7 +339,8 @@ class Job:
                 raise
             begun = False
             try:
-                api.put_archive(made, *grant_archive(self.launch))
+                for folder, archive in archives(self.launch):
+                    api.put_archive(made, folder, archive)
                 if guard is not None:
                     api.disconnect_container_from_network(made, network)
                 self._go_on()

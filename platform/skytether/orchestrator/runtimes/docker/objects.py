@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import itertools
 import posixpath
 import tarfile
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -31,9 +32,11 @@ _OWN = "instance"
 GRANT = f"{_ROOT}/{_OWN}/grant.json"
 READY = f"{_ROOT}/{_OWN}/ready.json"
 REPORTS = f"{_ROOT}/{_OWN}/{FILE_NAME}"
-_DATA = "data"
-DATA_FOLDER = f"{_ROOT}/{_DATA}"
-"""Where the volume is for what a service writes."""
+DATA_FOLDER = "/var/lib/skytether"
+"""Where the volume is for what a service writes: in no other volume, or what runs could have an engine mount it at any
+folder of the machine. An engine looks into containers that run, and mounts their volumes for that, from the outside."""
+DATA_BEFORE = f"{_ROOT}/data"
+"""Where earlier releases had it."""
 _LOG = {"max-size": "2m", "max-file": "2"}
 """The engine keeps at most this of each run's log."""
 _TMP = "/tmp"  # noqa: S108 (the container's own)
@@ -163,6 +166,10 @@ def declared(image: str, inspected: Mapping[str, Any]) -> Declared:
     volumes, health = tuple(config.get("Volumes") or ()), config.get("Healthcheck") or {}
     if len(volumes) > _MOST_VOLUMES:
         raise RuntimeFailure(f"its image declares {len(volumes)} volumes, and may declare {_MOST_VOLUMES}")
+    paths = {_ROOT, DATA_FOLDER, *(posixpath.normpath(f"/{path.lstrip('/')}") for path in volumes)}
+    for inner, outer in itertools.permutations(sorted(paths), 2):
+        if inner.startswith(f"{outer.rstrip('/')}/"):
+            raise RuntimeFailure(f"its image declares volumes so that {inner} is in {outer}; none may be in another")
     # Where it says 0 the engine's own holds, half a minute.
     return Declared(
         image, volumes, {key: least for key, least in _LEAST_BETWEEN_CHECKS.items() if 0 < health.get(key, 0) < least}
@@ -303,22 +310,27 @@ def _gpu_requests(gpus: tuple[int, ...]) -> list[dict[str, Any]]:
     return [{"Driver": "nvidia", "DeviceIDs": [str(number) for number in gpus], "Capabilities": [["gpu"]]}]
 
 
-def grant_archive(launch: Launch) -> tuple[str, bytes]:
-    """A folder of the container, and the tar file to unpack there before it starts: the grant, for the service alone.
+def archives(launch: Launch) -> Iterator[tuple[str, bytes]]:
+    """Folders of the container, and the tar file to unpack in each before it starts, for the service alone.
 
     The key goes this way, into a volume that is removed with the container, and no other.
     """
-    data = f"{_DATA}/{launch.instance}"
-    bound = {"bind_host": "0.0.0.0", "bind_port": INNER_PORT, "ready_file": READY, "data_dir": f"{_ROOT}/{data}"}  # noqa: S104 (in its own network)
+    data_dir = f"{DATA_FOLDER}/{launch.instance}"
+    bound = {"bind_host": "0.0.0.0", "bind_port": INNER_PORT, "ready_file": READY, "data_dir": data_dir}  # noqa: S104 (in its own network)
     grant = launch.grant.model_copy(update=bound).model_dump_json().encode()
+    entry = _owned(f"{_OWN}/grant.json", 0o400, tarfile.REGTYPE)
+    entry.size = len(grant)
+    yield _ROOT, _archive(_owned(_OWN, 0o700, tarfile.DIRTYPE), (entry, grant))
+    yield DATA_FOLDER, _archive(_owned(launch.instance, 0o700, tarfile.DIRTYPE))
+
+
+def _archive(folder: tarfile.TarInfo, *files: tuple[tarfile.TarInfo, bytes]) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w") as tar:
-        for folder in (_OWN, _DATA, data):
-            tar.addfile(_owned(folder, 0o700, tarfile.DIRTYPE))
-        entry = _owned(f"{_OWN}/grant.json", 0o400, tarfile.REGTYPE)
-        entry.size = len(grant)
-        tar.addfile(entry, io.BytesIO(grant))
-    return _ROOT, buffer.getvalue()
+        tar.addfile(folder)
+        for entry, content in files:
+            tar.addfile(entry, io.BytesIO(content))
+    return buffer.getvalue()
 
 
 def _owned(path: str, mode: int, kind: bytes) -> tarfile.TarInfo:

@@ -12,7 +12,7 @@ from ..base import Observation, Phase
 from ..containers import exit_status, last_line, out_of_memory
 from .limits import NO_LIMITS, ContainerLimits, pull_limits
 from .meter import Usage
-from .objects import ATTEMPT, DATA_FOLDER, GPUS, HELPER, INNER, INSTANCE, NAMESPACE, PORT
+from .objects import ATTEMPT, DATA_BEFORE, DATA_FOLDER, GPUS, HELPER, INNER, INSTANCE, NAMESPACE, PORT
 from .options import DockerOptions
 
 _LONGEST = 200
@@ -108,7 +108,7 @@ def parse(inspected: Mapping[str, Any]) -> ContainerState | None:
         host_port=port or (_port(labels[PORT]) if labels.get(PORT, "").isdecimal() else None),
         ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
         gpus=frozenset(int(number) for number in labels.get(GPUS, "").split(",") if number.isdecimal()),
-        volume=volumes.pop(DATA_FOLDER, ""),
+        volume=volumes.pop(DATA_FOLDER, "") or volumes.pop(DATA_BEFORE, ""),
         other_volumes=tuple(volumes.values()),
         namespace=labels.get(NAMESPACE, ""),
     )
