@@ -29,7 +29,18 @@ def test_what_waited_for_an_end_that_stood_still_is_late_and_the_newest_is_not()
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 2.0])
 def test_a_slow_path_holds_nothing_back(delay: float) -> None:
-    assert not any(seen(WHEELS, *((0.1 * n, 0.1 * n + delay) for n in range(50))))
+    """How long it takes is known by half, as clocks are compared over it."""
+    assert not any(seen(WHEELS, *((0.1 * n, 0.1 * n + delay) for n in range(50)), error=delay))
+
+
+def test_of_a_path_that_is_slow_one_way_only_the_first_second_is_held_back() -> None:
+    late = seen(WHEELS, *((n / 8, n / 8 + 0.5) for n in range(24)), error=0.25)
+    assert late == [True] * 8 + [False] * 16
+
+
+def test_what_waited_before_the_first_is_late() -> None:
+    """There is none before it, and those after it are less late."""
+    assert all(seen(WHEELS, *((1.0 + 0.02 * n, 3.0) for n in range(50)), error=0.01))
 
 
 def test_on_a_path_that_gets_slower_by_little_at_a_time_nothing_is_held_back() -> None:

@@ -18,7 +18,7 @@ class HeldBack:
 
     A path may take any time. But after an end, or a network, that stood still all that waited comes at once, and there
     may be nobody who says anything after it. So one that took longer than the one before it, by more than its lifespan,
-    is late.
+    is late; and of the first, of which none tells how long the path takes, what took longer than its lifespan.
     """
 
     def __init__(self, row: Topic) -> None:
@@ -44,7 +44,7 @@ class HeldBack:
         if not self._judges or isinf(message.sent_at_error):
             return False
         took, now = message.received_at - message.sent_at, message.received_at
-        if self._usual is not None and took - self._usual > self._lifespan + message.sent_at_error:
+        if took - (self._usual or 0.0) > self._lifespan + message.sent_at_error:
             if self._since is None:
                 self._since = now
             if now - self._since < _ANOTHER_PATH_S:

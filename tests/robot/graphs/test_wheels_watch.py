@@ -1,6 +1,6 @@
 import pytest
 
-from skytether.robot.graphs.wheels_watch import LEFT_BEHIND, MOST, UNNAMED, Others, WheelsWatch, strangers
+from skytether.robot.graphs.wheels_watch import LEFT_BEHIND, MOST, UNNAMED, Doubles, Others, WheelsWatch, strangers
 
 OURS = ("/skytether_guard", "/skytether_gate")
 
@@ -13,13 +13,28 @@ OURS = ("/skytether_guard", "/skytether_gate")
         (["/skytether_guard"], ()),
         ([*OURS, "/teleop"], ("/teleop",)),
         (["/teleop", "/teleop"], ("/teleop",)),
-        (["", ""], ()),
-        (["", "", ""], (UNNAMED,)),
-        ([*OURS, ""], (UNNAMED,)),
+        ([*OURS, ""], ()),
     ],
 )
 def test_who_is_none_of_ours(found, expected):
     assert strangers(found, OURS) == expected
+
+
+@pytest.mark.parametrize("found", [["", "", ""], [*OURS, ""], [OURS[0], "", ""]])
+def test_one_more_without_a_name_is_told_once_it_stays(found):
+    doubles = Doubles(OURS)
+    assert {doubles.poll(found) for _ in range(LEFT_BEHIND)} == {()}
+    assert doubles.poll(found) == (UNNAMED,)
+    assert doubles.poll(["", ""]) == ()
+
+
+@pytest.mark.parametrize("shown", [OURS[0], ""])
+def test_several_of_ours_that_were_killed_one_after_the_other_are_no_others(shown):
+    """DDS shows each for 20 s; one is there all the time, and the next one after that."""
+    doubles = Doubles(OURS)
+    for look in range(200):
+        left = sum(at <= look < at + 20 for at in range(10, 150, 12))
+        assert doubles.poll([*OURS, *[shown] * left]) == ()
 
 
 def test_a_crowd_is_cut_off():

@@ -9,7 +9,7 @@ from skytether.api.manifest import TopicSpec
 from skytether.ros.names import Names
 from skytether.ros.permissions import Permissions, refused
 
-from .wheels_watch import sentence, strangers
+from .wheels_watch import UNNAMED, sentence, strangers, unnamed
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Finding:
 
 def other_publishers(topic: str | None, found: Collection[str], own: Collection[str]) -> list[Finding]:
     """Who else tells the wheels what to do."""
-    names = strangers(found, own)
+    names = (*strangers(found, own), *([UNNAMED] if unnamed(found, own) else []))
     if topic is None or not names:
         return []
     return [Finding("wheels", topic, "", sentence(topic, names), good=False)]

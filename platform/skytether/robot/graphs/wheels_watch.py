@@ -48,35 +48,43 @@ class WatchesWheels(Protocol):
 
 
 def strangers(found: Collection[str], own: Collection[str]) -> tuple[str, ...]:
-    """Who of the publishers found is none of ours.
+    """Who of the publishers found has a name that is none of ours.
 
     Args:
         found: Names of nodes, one for each publisher; empty where the graph does not tell it.
-        own: Ours; as many unnamed ones are taken for ours.
+        own: Ours.
     """
-    left = Counter(found)
-    unnamed = left.pop("", 0)
-    hidden = sum(1 for name in own if name not in left)
-    names = sorted(name for name in left if name not in own)
-    return tuple(names[:MOST] + ([UNNAMED] if unnamed > hidden else []))
+    return tuple(sorted({*found} - {*own, ""})[:MOST])
+
+
+def unnamed(found: Collection[str], own: Collection[str]) -> int:
+    """How many publishers without a name there are, beyond those of ours that may be among them."""
+    return max(0, sum(not name for name in found) - len({*own} - {*found}))
 
 
 class Doubles:
-    """Who has a name of ours and is none of ours: another gate for the same wheels, of the same configuration. Pure.
+    """Who has a name of ours, or none, and is none of ours: as another gate of the same configuration is. Pure.
 
     Args:
-        own: Names of the nodes that may publish the topic, once each.
+        own: Names of the nodes that may publish the topic, once each; as many unnamed ones are taken for ours.
     """
 
     def __init__(self, own: Collection[str]) -> None:
         self._own = own
-        self._looks: dict[str, int] = {}
+        self._looks: dict[str, tuple[int, int]] = {}
+        """By name, how many there are too many, and for how many looks there were so many."""
 
     def poll(self, found: Collection[str]) -> tuple[str, ...]:
-        """Names, in words, of those that are there twice for longer than one that was killed is shown."""
+        """In words, those that are there for longer than one of ours that was killed is shown.
+
+        Where several were killed one after the other, how many are shown changes again and again.
+        """
         counts = Counter(found)
-        self._looks = {name: self._looks.get(name, 0) + 1 for name in self._own if counts[name] > 1}
-        return tuple(sorted(f"another {name}" for name, looks in self._looks.items() if looks > LEFT_BEHIND))
+        more = {name: counts[name] - 1 for name in self._own} | {"": unnamed(found, self._own)}
+        seen = {name: self._looks.get(name, (0, 0)) for name in more}
+        self._looks = {name: (n, seen[name][1] + 1 if seen[name][0] == n else 1) for name, n in more.items() if n > 0}
+        there = sorted(name for name, (_, looks) in self._looks.items() if looks > LEFT_BEHIND)
+        return tuple(f"another {name}" if name else UNNAMED for name in there)
 
 
 class WheelsWatch:

@@ -23,6 +23,7 @@ from skytether.ros.followed import Followed
 from skytether.ros.names import GraphNameError, Names, ros1_type
 from skytether.ros.notes import NOTES, Notes, TypeNote
 from skytether.ros.permissions import Access, Permissions
+from skytether.ros.ros2.native.side.stalls import TURN_S, Stalls
 from skytether.ros.static_tf import TOPIC as TF_STATIC
 from skytether.ros.static_tf import StaticTransforms
 from skytether.ros.velocities import VELOCITIES, HeldBack
@@ -131,6 +132,8 @@ class Ros1Port:
         self._others = Notes()
         self._said: set[str] = set()
         self._closed = False
+        self._ended = threading.Event()
+        self._stalls = Stalls(boottime())
         self._survey_due = threading.Event()
         self._thread = threading.Thread(target=self._survey, name="ros1-survey", daemon=True)
 
@@ -138,6 +141,8 @@ class Ros1Port:
 
     def attach(self, publisher: Publisher) -> None:
         self._peer = cast(Peer, publisher)
+        if any(topic.type in VELOCITIES for topic in self._sends):
+            threading.Thread(target=self._turn, name="ros1-stalls", daemon=True).start()
         for topic in self._sends:
             self._listen(topic)
         for name, caller in self._calls.items():
@@ -183,6 +188,7 @@ class Ros1Port:
         """Leave the graph; the node stays."""
         with self._lock:
             self._closed = True
+            self._ended.set()
             ends, self._ends = self._ends, []
             publications, self._publications = self._publications, {}
             servers, self._servers = self._servers, {}
@@ -225,6 +231,10 @@ class Ros1Port:
         merge = StaticTransforms("ros1").merge if name == TF_STATIC else None
 
         def on_message(data: bytes, _: PublisherInfo) -> None:
+            if topic.type in VELOCITIES and self._stalls.is_old(topic.name, None, boottime()):
+                self._peer.count_dropped(topic.name, 1)
+                self._log_once(f"{topic.name}: our end stood still; what came meanwhile is not taken")
+                return
             try:
                 self._peer.publish(topic.name, merge(data) if merge else data)
             except (KeyError, ValueError) as error:
@@ -232,6 +242,11 @@ class Ros1Port:
 
         listener = Listener(on_message, partial(self._on_publisher, topic))
         self._ends.append(self._node.subscribe(name, topic.type, self._md5(topic), listener))
+
+    def _turn(self) -> None:
+        """Thread that sees this process stand still: what waited for it in the kernel is old."""
+        while not self._ended.wait(TURN_S):
+            self._stalls.turn(boottime())
 
     def _on_publisher(self, topic: Topic, info: PublisherInfo) -> None:
         """In the node's thread: learn the type if it is not known everywhere."""

@@ -73,6 +73,9 @@ class Scene:
     def of(self, _instance: str) -> list[ContainerState]:
         return []
 
+    def shares(self, _container: str) -> bool:
+        return False
+
     def inspect(self, container: str) -> ContainerState:
         return ContainerState(container, "i1", 1, "running")
 

@@ -23,6 +23,7 @@ from skytether.api.manifest import ServiceSpec
 from skytether.lab.bench.transports.certificate import write_certificate
 from skytether.orchestrator.runtimes.base import Observation, Phase, RuntimeFailure
 from skytether.orchestrator.runtimes.docker import DockerRuntime
+from skytether.orchestrator.runtimes.docker.volumes import remove_left
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
 
@@ -294,6 +295,24 @@ def test_what_it_writes_stays(docker_site: DockerSite, runtime: DockerRuntime) -
     (volume,) = docker_site.volumes()
     toy = docker_site.images.toy
     assert docker("run", "--rm", "-v", f"{volume}:/d", "--entrypoint", "cat", toy, "/d/i1/recording") == "kept"
+
+
+def test_a_volume_of_which_another_container_may_have_a_folder_stays_until_that_one_has_ended(
+    docker_site: DockerSite, runtime: DockerRuntime
+) -> None:
+    """An engine that was built with an older Go follows a folder that becomes a link while it removes that."""
+    for instance in ("i1", "i2"):  # of one service and one robot: they have a volume of data in common
+        runtime.start(launch(docker_site, instance))
+        until_phase(runtime, Phase.RUNNING, instance)
+    assert len(docker_site.volumes()) == 3
+    runtime.remove("i1")
+    assert len(docker_site.containers()) == 1
+    remove_left(runtime.engine, docker_site.owner)
+    assert len(docker_site.volumes()) == 3
+    runtime.remove("i2")
+    assert len(docker_site.volumes()) == 2, "its own went with it"
+    remove_left(runtime.engine, docker_site.owner)
+    assert len(docker_site.volumes()) == 1, "that of data"
 
 
 def test_what_writes_too_much_is_ended_and_not_started_again_until_there_is_room(

@@ -26,6 +26,7 @@ class Process:
         return old
 
     def take(self, took, channel=CMD_VEL):
+        self.stalls.note(channel, self.now)
         return self.stalls.is_old(channel, None if took is None else CLOCK_S + took, self.now)
 
 
@@ -58,11 +59,35 @@ def test_what_is_sent_again_later_is_old_where_it_is_told_when_it_was_published(
     assert not process.take(2.5), "a publisher's clock was put back; there was no stall"
 
 
-def test_after_a_stall_a_topic_that_was_never_heard_has_no_usual_time(process):
+def test_after_a_stall_nothing_is_taken_where_none_tells_how_long_one_takes(process):
     process.now += 2.0
     process.run(1.0)
-    assert not process.take(2.5, OTHER)
-    assert not process.take(2.5, OTHER)
+    assert process.take(2.5, OTHER)
+    assert process.take(0.01, OTHER)
+    process.run(SENT_AGAIN_S)
+    assert not process.take(0.01, OTHER)
+
+
+@pytest.mark.parametrize("last", [0.0, 10.0])
+def test_where_two_publish_by_other_clocks_the_quickest_tells_who_is_old(process, last):
+    process.take(10.0)
+    process.take(last)
+    process.now += 2.0
+    process.run(1.0)
+    assert process.take(2.5)
+    assert process.take(10.0), "whose clock is behind waits with them"
+    process.run(SENT_AGAIN_S)
+    assert not process.take(10.0)
+
+
+def test_a_clock_that_drifts_away_is_followed(process):
+    for hour in range(5):
+        process.now += 3600.0
+        process.stalls.turn(process.now)
+        process.run(2 * SENT_AGAIN_S, took=0.01 + hour * 0.18)
+    process.now += 1.0
+    process.stalls.turn(process.now)
+    assert process.run(2.0, took=0.01 + 4 * 0.18) <= 5
 
 
 def test_a_loss_is_explained_by_a_stall_since_the_message_before(process):
@@ -73,6 +98,6 @@ def test_a_loss_is_explained_by_a_stall_since_the_message_before(process):
         process.stalls.turn(process.now)
     process.take(0.01)
     assert process.stalls.explains(CMD_VEL)
-    assert not process.stalls.explains(OTHER), "no velocities come there"
+    assert process.stalls.explains(OTHER), "nothing came before"
     process.run(0.5)
     assert not process.stalls.explains(CMD_VEL)

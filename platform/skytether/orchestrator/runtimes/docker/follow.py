@@ -149,6 +149,12 @@ class Follower:
         with self._lock:
             return sorted((s for s in self._seen.values() if s.instance == instance), key=lambda seen: seen.attempt)
 
+    def shares(self, container: str) -> bool:
+        """Whether another container that may run has its volume of data, too; of one that was not seen it may be so."""
+        with self._lock:
+            mine, others = self._seen.get(container), [s for s in self._seen.values() if s.id != container]
+        return mine is None or any(other.volume == mine.volume and not other.ended for other in others)
+
     def helpers(self) -> dict[str, Helper]:
         """Those of our containers that are no services, by id."""
         with self._lock:

@@ -49,6 +49,8 @@ NAMESPACE, PORT = f"{_PREFIX}/namespace", f"{_PREFIX}/port"
 """Of an instance in a network that was prepared: the container that holds it, and the UDP port published there."""
 EPOCH = f"{_PREFIX}/epoch"
 """Of containers: of the leader who had them made. Of volumes: who led here last."""
+BESIDE = f"{_PREFIX}/beside"
+"""Of volumes that go with their containers: the volume of data that the container has."""
 HELPER = f"{_PREFIX}/helper"
 """Of the other containers of ours: whom a guard closes off, and nobody where it holds a network namespace."""
 INNER = f"{INNER_PORT}/udp"
@@ -207,6 +209,7 @@ def container(
     environment = {**options.environment, GRANT_VARIABLE: GRANT}
     whose = {f"{_PREFIX}/robot": grant.robot, f"{_PREFIX}/service": grant.service, **_MANAGED}
     paths = {posixpath.normpath(path) for path in image.volumes} - {_ROOT, DATA_FOLDER, _TMP}
+    data = data_volume(owner, launch)
     return {
         "Image": image.id,
         # The rest of the check stays the image's.
@@ -238,10 +241,10 @@ def container(
             "Mounts": [
                 # By their labels they are found, should somebody remove the container without them.
                 *(
-                    _volume(path, {OWNER: owner, INSTANCE: grant.instance, **_MANAGED})
+                    _volume(path, {OWNER: owner, INSTANCE: grant.instance, BESIDE: data, **_MANAGED})
                     for path in [_ROOT, *sorted(paths)]
                 ),
-                _volume(DATA_FOLDER, {OWNER: owner, **whose}, data_volume(owner, launch)),
+                _volume(DATA_FOLDER, {OWNER: owner, **whose}, data),
             ],
             "Devices": [
                 {"PathOnHost": device, "PathInContainer": device, "CgroupPermissions": "rw"}

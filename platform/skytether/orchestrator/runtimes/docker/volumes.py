@@ -15,7 +15,7 @@ from ..now_and_then import NowAndThen
 from .client import document
 from .engine import Engine
 from .fence import remove_volume
-from .objects import INSTANCE, OWNER, stored_by_robot
+from .objects import BESIDE, INSTANCE, OWNER, stored_by_robot
 
 log = logging.getLogger(__name__)
 
@@ -45,18 +45,22 @@ def sizes(answer: Mapping[str, Any]) -> dict[str, int]:
 
 
 def remove_left(engine: Engine, owner: str, *, data: bool = False) -> None:
-    """Remove the volumes of containers that somebody removed without them: one of each holds a session's key.
+    """Remove the volumes of containers that were removed without them: one of each holds a session's key.
 
-    With ``data`` also those that outlive their containers.
+    With ``data`` also those that outlive their containers. What others may write to still stays (see `remove`).
 
     Raises:
         RuntimeFailure: The engine does not answer.
     """
     with engine.asked():
-        labels = [f"{OWNER}={owner}"] if data else [f"{OWNER}={owner}", INSTANCE]
-        wanted = {"label": labels, "dangling": True}
-        for volume in engine.api().volumes(wanted)["Volumes"] or ():
-            remove_volume(engine, volume["Name"])
+        label = [f"{OWNER}={owner}"] if data else [f"{OWNER}={owner}", INSTANCE]
+        api = engine.api()
+        left = api.volumes({"label": label, "dangling": True})["Volumes"] or ()
+        used = api.volumes({"label": [f"{OWNER}={owner}"], "dangling": False})["Volumes"] if left else ()
+        names = {volume["Name"] for volume in used or ()}
+        for volume in left:
+            if (volume.get("Labels") or {}).get(BESIDE) not in names:
+                remove_volume(engine, volume["Name"])
 
 
 class Scales:

@@ -129,8 +129,7 @@ class Program:
         """Of those that are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._hearing: dict[int, Hearing] = {}
-        self._stalls: Stalls | None = None
-        """Watched while velocities are taken."""
+        self._stalls = Stalls(_now())
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -150,7 +149,7 @@ class Program:
 
     def run(self, stream: Any) -> int:
         """Be the node until the agent's end of the socket is closed, or ROS 2 is shut down; returns the exit code."""
-        for job in (lambda: self._read(stream), self._watch):
+        for job in (lambda: self._read(stream), self._watch, self._turn):
             threading.Thread(target=job, daemon=True).start()
         alive_at = 0.0
         while not self._ended.is_set() and rclpy.ok():
@@ -283,6 +282,7 @@ class Program:
         self._sender.set(channel, priority, keep)
 
         def put(message: bytes) -> None:
+            self._stalls.note(channel, _now())
             self._sender.put(Frame(Kind.DATA, channel, message))
 
         take: Callable[..., object] = put
@@ -301,23 +301,21 @@ class Program:
 
     def _taker_of_velocities(self, channel: int) -> Callable[..., object]:
         """What `rclpy` calls with each."""
-        if self._stalls is None:
-            self._stalls = Stalls(_now())
-            threading.Thread(target=self._turn, args=(self._stalls,), daemon=True).start()
-        stalls = self._stalls
 
         def take(message: bytes, info: Any) -> None:
             sent = info["source_timestamp"]  # in ns; 0 where it is not told
-            if stalls.is_old(channel, time.time() - sent / 1e9 if sent else None, _now()):
+            self._stalls.note(channel, _now())
+            if self._stalls.is_old(channel, time.time() - sent / 1e9 if sent else None, _now()):
                 self._stale[channel] = self._stale.get(channel, 0) + 1
             else:
                 self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
 
         return take if _TELLS_TIMES else lambda message: take(message, {"source_timestamp": 0})
 
-    def _turn(self, stalls: Stalls) -> None:
+    def _turn(self) -> None:
+        """Thread that sees this process stand still."""
         while not self._ended.wait(TURN_S):
-            stalls.turn(_now())
+            self._stalls.turn(_now())
 
     def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
         self._names[channel] = name
@@ -389,8 +387,7 @@ class Program:
         """Count what a subscription loses because we take it too slowly, or not at all for a while."""
 
         def lost(event: Any) -> None:
-            stood = self._stalls is not None and self._stalls.explains(channel)
-            counted = self._stale if stood else self._lost
+            counted = self._stale if self._stalls.explains(channel) else self._lost
             counted[channel] = counted.get(channel, 0) + event.total_count_change
 
         callbacks = SubscriptionEventCallbacks(use_default_callbacks=False)
