@@ -86,7 +86,7 @@ class Engine:
                 if engine.networks and self.command == "GET" and (name := self.path.partition("/networks/")[2]):
                     missing, text = (
                         name not in engine.networks,
-                        json.dumps({"Labels": engine.networks.get(name)}).encode(),
+                        json.dumps({"Labels": engine.networks.get(name), "Containers": {"of others": {}}}).encode(),
                     )
                 if self.command == "GET" and "/archive" in self.path:
                     text = engine.file
@@ -252,6 +252,15 @@ def test_no_archive_changes_the_root_of_a_container(engine: Engine, archive: byt
     sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
     assert b"something else than folders of ours and a grant" in say(engine, sent)
     assert not any(line.startswith("PUT") for line in engine.lines)
+
+
+def test_of_a_network_no_container_is_told(engine: Engine) -> None:
+    """In an open one are those of the machine's owner, too."""
+    engine.networks = {"lan": {"skytether.io/open": "yes"}}
+    for version in ("", "/v1.41"):
+        got = say(engine, request(f"GET {version}/networks/lan"))
+        assert b"skytether.io/open" in got
+        assert b"of others" not in got
 
 
 @pytest.mark.parametrize(

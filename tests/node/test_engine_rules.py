@@ -121,6 +121,8 @@ def test_of_lists_only_what_orchestrators_made_is_passed_on(path: str) -> None:
         '{"label": ["skytether.io/owner"], "label": []}',
     ):
         assert "only what has the label" in str(listed(odd)), odd
+    for more in ('"since": ["a"]', '"before": ["a"]', '"name": ["a"]', '"Label": ["a"]', '"ancestor": {"a": true}'):
+        assert "which no site asks for" in str(listed(f'{{"label": ["skytether.io/owner"], {more}}}')), more
 
 
 def test_networks_volumes_pulls_and_limits_are_passed_on_as_the_runtime_asks_for_them() -> None:

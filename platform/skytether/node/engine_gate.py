@@ -22,7 +22,7 @@ from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
 from .archives import Images, cleaned, moved, ways
-from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, PORT, WEIGHED, Call, Subject, judge, plain, published
+from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, PORT, SEEN, WEIGHED, Call, Subject, judge, plain, published
 from .machine import Answer, ask, is_taken
 from .registries import Registries
 
@@ -32,8 +32,9 @@ _LINE = re.compile(rb"([A-Z]{3,7}) (/[!-~]{0,8000}) HTTP/1\.1")
 _PASSED = (b"accept", b"x-registry-auth")
 """Headers that the engine gets as they are. The type of what is sent is told by us: an engine reads a form, too, and
 believes it before the query."""
-_MOST_JSON, _MOST_ARCHIVE = 1 << 20, 2 << 20
-"""Bytes of a request's body; an archive holds a grant, with what a robot asked for."""
+_MOST_JSON, _MOST_ARCHIVE = 1 << 18, 2 << 20
+"""Bytes of a request's body; an archive holds a grant, with what a robot asked for. Of JSON, what was read takes forty
+times as much."""
 _MOST_FILE = MOST_BYTES + (8 << 10)
 """Of the archive of one file, which is one of reports: the file, and some heads of 512 bytes."""
 _MOST_DIGITS = 12
@@ -166,6 +167,8 @@ class EngineGate:
             return self._weigh(target)
         if path == MADE:
             return self._make(target, said)
+        if SEEN.fullmatch(path) and method == "GET":
+            return self._network(target)
         if path.endswith("/archive") and method == "GET":
             return self._file(target)
         return None
@@ -260,6 +263,13 @@ class EngineGate:
                 raise RefusedCall(f"orchestrators made {_MOST_NETWORKS} networks here, as many as they may")
             answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
         return answer.status, answer.content, _JSON
+
+    async def _network(self, target: str) -> tuple[int, bytes, str]:
+        """One that is open has containers of the machine's owner, too: nothing of them."""
+        status, found = await self._asked(target)
+        if isinstance(found, dict):
+            found = {key: value for key, value in found.items() if key not in ("Containers", "Peers", "Services")}
+        return status, json.dumps(found).encode(), _JSON
 
     async def _weigh(self, target: str) -> tuple[int, bytes, str]:
         """Of what there is what is ours."""

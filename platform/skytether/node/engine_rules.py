@@ -26,7 +26,7 @@ NOBODY = "-"
 """As an owner: the node itself made it, and no orchestrator touches it."""
 OPEN = "skytether.io/open"
 """Label of a network that the machine's owner made, and that containers of sites may be in."""
-MADE = "/networks/create"
+MADE, SEEN = "/networks/create", re.compile(r"/networks/[A-Za-z0-9][A-Za-z0-9_.-]*")
 WEIGHED = "/system/df"
 """Says of all that an engine has what it is and how large: of the answer what is ours is passed on only."""
 _CONTAINER_ID = "[0-9a-f]{64}"
@@ -229,7 +229,10 @@ def _listed(call: Call) -> str | None:
     filters = _json(call.query.get("filters", ""))
     labels = filters.get("label") if isinstance(filters, dict) else None
     ours = isinstance(labels, list) and any(str(one).partition("=")[0] == OWNER for one in labels)
-    return None if ours else f"only what has the label {OWNER} is listed"
+    if not ours or not isinstance(filters, dict):
+        return f"only what has the label {OWNER} is listed"
+    # By others an engine tells of what is not listed: whether there is a container by a name, and when it was made.
+    return _only(filters, {"label", "type", "dangling"}, "a list")
 
 
 def _archive(call: Call) -> str | None:
