@@ -22,7 +22,21 @@ from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
 from .archives import Images, cleaned, moved, ways
-from .engine_rules import MADE, NETWORK, NOBODY, OPEN, OWNER, PORT, SEEN, WEIGHED, Call, Subject, judge, plain, published
+from .engine_rules import (
+    MADE,
+    NETWORK,
+    NOBODY,
+    OPEN,
+    OWNER,
+    PORT,
+    SEEN,
+    WEIGHED,
+    Call,
+    Subject,
+    judge,
+    plain,
+    published,
+)
 from .machine import Answer, ask, is_taken
 from .registries import Registries
 
