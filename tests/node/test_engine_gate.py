@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import gzip
 import io
 import json
@@ -23,6 +24,7 @@ import pytest
 
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
+from skytether.node.kin import Kin
 from skytether.node.machine import is_taken
 from skytether.node.registries import registry_of
 
@@ -58,6 +60,14 @@ class Engine:
         """What is made there is removed at once by somebody."""
         self.networks: dict[str, dict[str, str]] = {}
         """Labels by name."""
+        self.running: set[str] = set()
+        """Containers, by their ids."""
+        self.idle: set[str] = set()
+        """Others that it has."""
+        self.others: dict[str, dict[str, Any]] = {}
+        """What orchestrators have, beside the one container: by ids and names what is said of it."""
+        self.slow: dict[str, threading.Event] = {}
+        """By what it is asked, what it waits for before it answers."""
         self.file = b""
         """What is in its containers."""
         self.digests: list[str] = []
@@ -73,8 +83,14 @@ class Engine:
                     self.close_connection = True
                     return
                 engine.asked.append((f"{self.command} {self.path}", dict(self.headers), body))
-                labels = {"skytether.io/owner": "edge"} if ID in self.path else {}
+                for asked, waits in engine.slow.items():
+                    if f"{self.command} {self.path}".startswith(asked):
+                        waits.wait(20)
+                other = next((one for one in engine.others if one in self.path), None)
+                labels = {"skytether.io/owner": "edge"} if ID in self.path or other else {}
                 said = {"Id": ID, "Config": {"Labels": labels}, "Labels": labels, "Image": "a", **engine.container}
+                if other:
+                    said |= {"Id": other, **engine.others[other]}
                 if "/system/df" in self.path:
                     said = {"Containers": [{"Command": "secret"}], "Volumes": engine.volumes}
                 if "/images/" in self.path and self.command == "GET":
@@ -83,6 +99,12 @@ class Engine:
                 missing = self.path.startswith("/images/new") or (engine.emptied and self.command in ("HEAD", "DELETE"))
                 if self.path.startswith("/networks?"):
                     text = json.dumps([{"Name": name} for name in engine.networks]).encode()
+                if self.path.startswith("/containers/json"):
+                    there = engine.running | (engine.idle if "all=1" in self.path else set())
+                    wanted = json.loads(parse_qs(urlsplit(self.path).query)["filters"][0]).get("id", there)
+                    text = json.dumps([{"Id": one} for one in there & set(wanted)]).encode()
+                if self.path == "/volumes":
+                    text = json.dumps({"Volumes": engine.volumes}).encode()
                 if engine.networks and self.command == "GET" and (name := self.path.partition("/networks/")[2]):
                     missing, text = (
                         name not in engine.networks,
@@ -98,8 +120,9 @@ class Engine:
                 }
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
                 self.send_header("Content-Length", str(len(text)))
-                self.end_headers()
-                self.wfile.write(text if self.command != "HEAD" else b"")
+                with contextlib.suppress(BrokenPipeError):  # whoever asked may wait no more
+                    self.end_headers()
+                    self.wfile.write(text if self.command != "HEAD" else b"")
 
             do_HEAD = do_GET = do_POST = do_PUT = do_DELETE = _serve  # noqa: N815 (the library's names)
 
@@ -613,6 +636,223 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
         return taken
 
     assert asyncio.run(run()) <= 16
+
+
+X, Y, Z = "a" * 64, "b" * 64, "c" * 64
+OWN = "9" * 64
+"""The volume that X alone has."""
+
+
+def in_volumes(*names: str, network: str = "skytether") -> dict[str, Any]:
+    """A container that has these."""
+    mounts = [volume(f"/v{number}", name) for number, name in enumerate(names)]
+    return {"HostConfig": {"NetworkMode": network, "ReadonlyRootfs": True}, "Mounts": mounts}
+
+
+class Site:
+    """An orchestrator's connection after another, at one gate."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+        self.gate = EngineGate(engine.path)
+
+    async def ask(self, line: str) -> bytes:
+        """What is answered by the gate, or sent on to the engine."""
+        reader, back = asyncio.StreamReader(), AsyncMock(asyncio.StreamWriter, write=Mock())
+        reader.feed_data(request(line))
+        reader.feed_eof()
+        await self.gate.pass_requests((reader, back), (reader, back))
+        return b"".join(call.args[0] for call in back.write.call_args_list)
+
+    async def start(self, container: str) -> None:
+        assert b"200 OK" in await self.ask(f"POST /v1.41/containers/{container}/start")
+        self.engine.running.add(container)
+
+    async def soon(self, begins: str) -> None:
+        """The engine is asked something."""
+        async with asyncio.timeout(10):
+            while not any(line.startswith(begins) for line in self.engine.lines):
+                await asyncio.sleep(0.01)
+
+    @property
+    def removed(self) -> list[str]:
+        return [line.removeprefix("DELETE /v1.41/") for line in self.engine.lines if line.startswith("DELETE /v1.41")]
+
+
+@pytest.mark.parametrize("by", ["a volume", "a network", "somebody who has ended"])
+def test_files_stay_while_somebody_runs_who_may_have_a_folder_of_them(
+    engine: Engine, by: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As the engine removes them he makes a folder a link, and it removes what is there, as root."""
+    engine.others = {
+        X: in_volumes(OWN, "skytether-s"),
+        Y: in_volumes("skytether-s", "skytether-t") if by != "a network" else in_volumes(network=f"container:{X}"),
+        Z: in_volumes("skytether-t"),
+    }
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        await site.start(Y)
+        if by == "somebody who has ended":
+            await site.start(Z)
+            engine.running.discard(Y)
+        assert b"200 OK" in await site.ask(f"DELETE /v1.41/containers/{X}?v=1&link=0&force=1")
+        assert site.removed == [f"containers/{X}?link=0&force=1"]
+        engine.running.discard(X)
+        for _ in range(3):
+            said = await site.ask(f"DELETE /v1.41/volumes/{OWN}")
+            assert b"409 Conflict" in said
+            assert b"containers run that may have a folder of it open" in said
+            assert b"Connection: close" not in said
+        assert len(site.removed) == 1
+        engine.running.clear()
+        assert b"200 OK" in await site.ask(f"DELETE /v1.41/volumes/{OWN}?force=0")
+        assert site.removed[1:] == [f"volumes/{OWN}?force=0"]
+
+    engine.others[OWN] = {}  # it is an orchestrator's, too
+    asyncio.run(run())
+    assert not caplog.messages
+
+
+def test_volumes_go_with_a_container_that_has_no_kin_though_it_runs(engine: Engine) -> None:
+    engine.others = {X: in_volumes(OWN, "skytether-s"), Y: in_volumes("skytether-t"), Z: in_volumes("skytether-s")}
+
+    async def run() -> None:
+        site = Site(engine)
+        for container in (X, Y):
+            await site.start(container)
+        await site.ask(f"DELETE /v1.41/containers/{X}?v=1&force=1")
+        await site.start(Z)  # nothing is left that it could have
+        await site.ask(f"DELETE /v1.41/containers/{Y}?force=1&v=True")
+        assert site.removed == [f"containers/{X}?v=1&force=1", f"containers/{Y}?force=1&v=True"]
+        assert site.gate._removals._kin.all() == {Z, "volume skytether-s"}  # noqa: SLF001 all others are forgotten
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("state", ["runs", "starts", "is idle"])
+def test_of_what_was_there_before_nobody_knows_whom_it_met(
+    engine: Engine, state: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The node's program was started anew: it has not seen what met until then, and what was just being started."""
+    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.2)
+    engine.volumes = [{"Name": OWN}, {"Name": "skytether-s"}]
+    engine.others = {X: in_volumes("skytether-s"), Y: in_volumes("skytether-t"), Z: in_volumes()}
+    (engine.running if state == "runs" else engine.idle).add(Z)
+    if state == "starts":
+        engine.slow = {f"GET /containers/{Z}/json": threading.Event()}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        await site.start(Y)
+        if state == "starts":
+            engine.slow.clear()
+            engine.running.add(Z)
+        await site.ask(f"DELETE /v1.41/containers/{X}?v=1&force=1")
+        await site.ask(f"DELETE /v1.41/containers/{Y}?v=1&force=1")
+        kept = state != "is idle"
+        assert site.removed == [f"containers/{X}?{'' if kept else 'v=1&'}force=1", f"containers/{Y}?v=1&force=1"]
+
+    asyncio.run(run())
+
+
+def test_a_volume_with_a_name_stays_while_anybody_runs_whose_start_nobody_saw(engine: Engine) -> None:
+    """Another orchestrator at this engine, by another program of a node, could have had it, and given a folder away."""
+    engine.others = {X: in_volumes("skytether-s"), Z: in_volumes(), "skytether-s": {}}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        engine.running = {Z}
+        removes = "DELETE /v1.41/volumes/skytether-s"
+        assert b"409 Conflict" in await site.ask(removes)
+        engine.running = set()
+        await site.start(X)
+        assert b"409 Conflict" in await site.ask(removes)
+        engine.running = set()
+        assert b"200 OK" in await site.ask(removes)
+        assert site.removed == ["volumes/skytether-s"]
+
+    asyncio.run(run())
+
+
+def test_a_start_that_is_under_way_counts_as_one_that_runs(engine: Engine) -> None:
+    engine.others = {X: in_volumes(OWN, "skytether-s"), Y: in_volumes("skytether-s")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        starts, engine.slow = f"POST /v1.41/containers/{Y}/start", {}
+        engine.slow[starts] = threading.Event()
+        asks = asyncio.create_task(site.ask(starts))
+        await site.soon(starts)
+        asks.cancel()  # the engine goes on, though nobody waits for it
+        await site.ask(f"DELETE /v1.41/containers/{X}?v=1&force=1")
+        assert site.removed == [f"containers/{X}?force=1"]
+        engine.slow[starts].set()
+
+    asyncio.run(run())
+
+
+def test_no_kin_starts_while_files_are_removed_and_all_others_do(engine: Engine) -> None:
+    engine.others = {X: in_volumes(OWN, "skytether-s"), Y: in_volumes("skytether-s"), Z: in_volumes("skytether-t")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        removes = f"DELETE /v1.41/containers/{X}?v=1"
+        engine.slow[removes] = threading.Event()
+        asks = asyncio.create_task(site.ask(removes))
+        await site.soon(removes)
+        asks.cancel()
+        waits = asyncio.create_task(site.start(Y))
+        await site.start(Z)
+        await asyncio.sleep(0.1)
+        assert not waits.done()
+        assert f"POST /v1.41/containers/{Y}/start" not in engine.lines
+        engine.slow[removes].set()
+        await waits
+
+    asyncio.run(run())
+
+
+def test_a_start_waits_some_time_for_a_removal_and_is_told(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skytether.node.removals._WAIT_S", 0.1)
+    engine.others = {X: in_volumes(OWN, "skytether-s"), Y: in_volumes("skytether-s")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        removes = f"DELETE /v1.41/containers/{X}?v=1"
+        engine.slow[removes] = threading.Event()
+        asks = asyncio.create_task(site.ask(removes))
+        await site.soon(removes)
+        said = await site.ask(f"POST /v1.41/containers/{Y}/start")
+        assert b"503 Service Unavailable" in said
+        assert b"a volume is being removed that it may get a folder of" in said
+        engine.slow[removes].set()
+        await asks
+        await site.start(Y)
+
+    asyncio.run(run())
+
+
+def test_what_has_ended_is_forgotten_before_there_is_no_room_for_more(engine: Engine) -> None:
+    engine.others = {X: in_volumes("skytether-s"), Y: in_volumes("skytether-t"), Z: in_volumes("skytether-u")}
+
+    async def run() -> None:
+        site = Site(engine)
+        site.gate._removals._kin = Kin(most=4)  # noqa: SLF001 as many as few containers have
+        await site.start(X)
+        await site.start(Y)
+        assert b"503 Service Unavailable" in await site.ask(f"POST /v1.41/containers/{Z}/start")
+        engine.running.discard(X)
+        await site.start(Z)
+
+    asyncio.run(run())
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import Awaitable
 from http import HTTPStatus
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlencode
 
 from skytether.api.printable import printable
@@ -39,9 +39,11 @@ from .engine_rules import (
 )
 from .machine import Answer, ask, is_taken
 from .registries import Registries
+from .removals import BusyError, Removals
 
 log = logging.getLogger(__name__)
 
+_T = TypeVar("_T")
 _LINE = re.compile(rb"([A-Z]{3,7}) (/[!-~]{0,8000}) HTTP/1\.1")
 _PASSED = (b"accept", b"x-registry-auth")
 """Headers that the engine gets as they are. The type of what is sent is told by us: an engine reads a form, too, and
@@ -72,6 +74,7 @@ _MOST_TOLD, _TOLD_S = 20, 600.0
 _MADE_S, _MOST_NETWORKS = 60.0, 12
 """For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
 take them all has addresses that the machine knows elsewhere."""
+_MAKES = ("/containers/create", "/volumes/create")
 _JSON, _TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 _WEIGH_S, _MOST_WEIGHED = 300.0, 32 << 20
 """What an engine may take to say how large all is that it has: seconds, and bytes."""
@@ -103,6 +106,7 @@ class EngineGate:
         self._opened: set[str] = set()
         """Containers into whose files the engine may look."""
         self._images = Images(engine)
+        self._removals = Removals(engine)
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
         self._large = asyncio.Semaphore(_MOST_LARGE)
@@ -157,14 +161,15 @@ class EngineGate:
                 said = json.loads(body) if body and not archive else None
             except (ValueError, RecursionError):
                 raise RefusedCall("its body is no JSON") from None
-            await self._check(Call(method, unquote(path), query, said))
+            call = Call(method, unquote(path), query, said)
+            await self._check(call)
             if archive:
                 made = cleaned(body, query["path"])
                 if made is None:
                     raise RefusedCall("its archive has something else than folders of ours and a grant")
                 body = made
             target = path + (f"?{urlencode(query)}" if query else "")
-            if answered := self._answered(method, plain(unquote(path)), target, said):
+            if answered := self._answered(call, path, target):
                 await _answer(back, *await answered)
                 return
             if not archive:
@@ -175,16 +180,31 @@ class EngineGate:
             writer.write(head + passed + b"\r\n" + body)
             await writer.drain()
 
-    def _answered(self, method: str, path: str, target: str, said: Any) -> Awaitable[tuple[int, bytes, str]] | None:
-        """What is asked of the engine by us, who then answer in its place; None: it answers itself."""
+    def _answered(self, call: Call, way: str, target: str) -> Awaitable[tuple[int, bytes, str]] | None:
+        """What is asked of the engine by us, who then answer in its place; None: it answers itself.
+
+        Args:
+            call: What is asked.
+            way: Its path, as it was written.
+            target: With the query.
+        """
+        path = plain(call.path)
+        _, kind, name = (*path.split("/"), "", "")[:3]
         if path == WEIGHED:
             return self._weigh(target)
         if path == MADE:
-            return self._make(target, said)
-        if SEEN.fullmatch(path) and method == "GET":
+            return self._make(target, call.body)
+        if SEEN.fullmatch(path) and call.method == "GET":
             return self._network(target)
-        if path.endswith("/archive") and method == "GET":
+        if path.endswith("/archive") and call.method == "GET":
             return self._file(target)
+        if kind == "containers" and path.endswith("/start"):
+            return self._start(name, target)
+        if call.method == "DELETE" and kind == "volumes":
+            return self._kept(self._removals.remove_volume(name, target))
+        if call.method == "DELETE" and kind == "containers" and "v" in call.query:
+            rest = urlencode({key: value for key, value in call.query.items() if key != "v"})
+            return self._kept(self._removals.remove_container(name, target, f"{way}?{rest}"))
         return None
 
     async def _check(self, call: Call) -> None:
@@ -203,8 +223,8 @@ class EngineGate:
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
         if call.path.endswith("/archive"):
             await self._may_be_opened(subjects[0][1])
-        elif plain(call.path).endswith("/start"):
-            await self._may_be_started(subjects[0][1])
+        elif plain(call.path) in _MAKES:
+            await self._tried(self._removals.look_back())
         elif plain(call.path).endswith("/connect"):
             _may_be_published((await self._asked(f"/containers/{subjects[0][1]}/json"))[1])
 
@@ -245,8 +265,8 @@ class EngineGate:
         self._opened = self._opened if len(self._opened) < _KNOWN else set()
         self._opened.add(container)
 
-    async def _may_be_started(self, container: str) -> None:
-        """Raises unless its networks are ours still: it is connected by their names as it starts.
+    async def _may_be_started(self, container: str) -> Any:
+        """What the engine says of it; raises unless its networks are ours still: by their names it is connected.
 
         And the engine looks into its files: it mounts its volumes, and reads who it is.
         """
@@ -261,6 +281,24 @@ class EngineGate:
                     raise RefusedCall(f"network {name} not found", HTTPStatus.NOT_FOUND)
                 raise RefusedCall(f"{name[:80]} is not of an orchestrator")
         await self._may_be_opened(container)
+        return found
+
+    async def _start(self, container: str, target: str) -> tuple[int, bytes, str]:
+        found = await self._may_be_started(container)
+        return await self._kept(self._removals.start(container, found, target))
+
+    async def _kept(self, answer: Awaitable[Answer]) -> tuple[int, bytes, str]:
+        """Of what was started or removed."""
+        done = await self._tried(answer)
+        return done.status, done.content, _JSON
+
+    async def _tried(self, work: Awaitable[_T]) -> _T:
+        try:
+            return await work
+        except BusyError as error:
+            raise RefusedCall(str(error), HTTPStatus.SERVICE_UNAVAILABLE) from error
+        except (OSError, ValueError) as error:
+            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
     async def _file(self, target: str) -> tuple[int, bytes, str]:
         """An engine that waits until somebody takes the rest of a file lets nobody end its container."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import hashlib
 import http.client
 import json
 import os
 import platform
+import re
 import shutil
 import socket
 from collections.abc import Mapping
@@ -27,6 +29,7 @@ _ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
 _ENGINE_S = 10.0
 _MOST = 1 << 20
 """Bytes of an engine's answer."""
+_STATUS = re.compile(rb"HTTP/1\.[01] ([1-5]\d\d)\b")
 
 
 @dataclass(frozen=True)
@@ -130,6 +133,35 @@ def ask(
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
     finally:
         connection.close()
+
+
+async def ask_long(path: str, what: str, *, method: str) -> Answer:
+    """One call that an engine may take any time for; of its answer there is the status, and what is in it.
+
+    It takes no thread meanwhile: these are few.
+
+    Args:
+        path: Of the engine's socket.
+        what: Path and query.
+        method: As HTTP names it.
+
+    Raises:
+        OSError: It does not answer.
+        ValueError: It answers something else.
+    """
+    reader, writer = await asyncio.open_unix_connection(path)
+    try:
+        # By this version an engine says no more than one answer, in one piece.
+        writer.write(f"{method} {what} HTTP/1.0\r\nHost: engine\r\nContent-Length: 0\r\n\r\n".encode())
+        said = b""
+        while len(said) < _MOST and (piece := await reader.read(_MOST - len(said))):
+            said += piece
+    finally:
+        writer.transport.abort()
+    head, _, content = said.partition(b"\r\n\r\n")
+    if not (found := _STATUS.match(head)):
+        raise ValueError("it ended before it said whether it did it")
+    return Answer(int(found[1]), {}, content)
 
 
 def free_mb(folder: str) -> int | None:
