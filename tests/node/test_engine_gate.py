@@ -427,6 +427,20 @@ def test_a_container_starts_where_nobody_moves_what_is_mounted_in_it(engine: Eng
         assert says in say(engine, start)
 
 
+@pytest.mark.parametrize(("test", "good"), [(["CMD"], False), (["CMD", "true"], True), (None, True)])
+def test_no_container_starts_whose_image_has_a_health_check_that_ends_the_engine(
+    engine: Engine, test: list[str] | None, good: bool
+) -> None:
+    """Of what it was made of it had none: the engine took its image's."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    config = {"Labels": {"skytether.io/owner": "edge"}, "Healthcheck": {"Test": test}}
+    engine.container = {"Config": config, "HostConfig": {"NetworkMode": "skytether", "ReadonlyRootfs": True}}
+    got = say(engine, request(f"POST /v1.41/containers/{ID}/start"))
+    assert (b"200 OK" in got) is good
+    assert (b"its health check ['CMD'] has no command" in got) is not good
+    assert any(line.endswith("/start") for line in engine.lines) is good
+
+
 @pytest.mark.parametrize("address", ["", "127.0.0.1", "::1"])
 def test_no_container_is_published_at_a_port_that_a_program_of_this_machine_has(engine: Engine, address: str) -> None:
     """Engines lead there what comes for it, until they find that it is taken; connected, it is published, too."""

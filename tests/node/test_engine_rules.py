@@ -268,6 +268,27 @@ def test_no_container_is_made_that_is_the_machine_itself(changes: dict[str, Any]
 
 
 @pytest.mark.parametrize(
+    ("check", "says"),
+    [
+        (None, "None"),
+        ({}, "None"),
+        ({"Interval": 10**9}, "None"),
+        ({"Test": ["CMD", "true"], "Interval": 10**9, "StartInterval": 10**9}, "None"),
+        ({"Test": ["CMD"]}, "its health check ['CMD'] has no command"),
+        ({"Test": ["CMD-SHELL"]}, "has no command"),
+        ({"Test": "CMD"}, "has no command"),
+        ({"test": ["CMD"]}, "a health check has 'test'"),
+        ({"Test": ["NONE"], "TEST": ["CMD"]}, "a health check has 'TEST'"),
+        (["CMD"], "a health check has ''"),
+    ],
+)
+def test_no_container_is_made_whose_health_check_ends_the_engine(check: Any, says: str) -> None:
+    """It looks for the first word of a command that has none, and all containers of the machine end with it."""
+    body = {"Image": "a", "Labels": OWNER, "HostConfig": HOST, "Healthcheck": check}
+    assert says in str(asked("POST", "/containers/create", body))
+
+
+@pytest.mark.parametrize(
     ("method", "path", "body", "query"),
     [
         ("POST", f"/containers/{ID}/exec", {}, {}),

@@ -33,6 +33,7 @@ from .engine_rules import (
     WEIGHED,
     Call,
     Subject,
+    checked,
     judge,
     plain,
     published,
@@ -273,6 +274,8 @@ class EngineGate:
         status, found = await self._asked(f"/containers/{container}/json")
         if status != HTTPStatus.OK:
             raise RefusedCall(f"No such container: {container}", HTTPStatus.NOT_FOUND)
+        if odd := checked((found.get("Config") or {}).get("Healthcheck")):
+            raise RefusedCall(odd)
         _may_be_published(found)
         mode = str((found.get("HostConfig") or {}).get("NetworkMode"))
         for name in sorted({*((found.get("NetworkSettings") or {}).get("Networks") or ()), mode}):

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
+from skytether.api.health_check import is_borne
 from skytether.api.service_report import FILE_NAME
 
 from .seccomp_rules import holds, keeps_in, once
@@ -73,6 +74,7 @@ _CALLS = tuple(
 _WITH_BODY = {"create", "update", "network made", "joined", "volume made"}
 _LIMITS = {"Memory", "MemorySwap", "NanoCpus", "CpuShares"}
 _CONTAINER = {"Image", "Healthcheck", "User", "Env", "ExposedPorts", "Labels", "HostConfig", "Entrypoint", "Cmd"}
+_CHECK = {"Test", "Interval", "Timeout", "StartPeriod", "StartInterval", "Retries"}
 _HOST = _LIMITS | {
     *("NetworkMode", "PortBindings", "Dns", "ExtraHosts", "Init", "ReadonlyRootfs", "CapDrop", "CapAdd", "SecurityOpt"),
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
@@ -248,6 +250,8 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
     checks = (
         _only(body, _CONTAINER, "a container"),
         _only(host, _HOST, "a container"),
+        _only(_at(body, "Healthcheck"), _CHECK, "a health check"),
+        checked(body.get("Healthcheck")),
         None if OWNER in _at(body, "Labels") else f"it has no label {OWNER}",
         None if re.fullmatch(f"container:{_CONTAINER_ID}|{_ID}", mode) else f"its network is '{mode[:80]}'",
         None if mode.startswith("container:") else _network_name(mode),
@@ -288,6 +292,12 @@ def _security(options: Any, *, guards: bool) -> str | None:
     if guards and not (profiles and all(keeps_in(profile[8:]) for profile in profiles)):
         return "a guard has a seccomp profile by which its right ends at its own network"
     return None
+
+
+def checked(check: Any) -> str | None:
+    """Why a health check would end the engine, in a sentence: of what is asked for, or of a container's description."""
+    test = check.get("Test") if isinstance(check, dict) else check
+    return None if is_borne(test) else f"its health check {str(test)[:80]} has no command: an engine ends by that"
 
 
 def published(bound: Any) -> str | None:

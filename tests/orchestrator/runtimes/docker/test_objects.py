@@ -83,8 +83,17 @@ def test_an_image_has_its_health_checked_no_more_than_once_a_second() -> None:
     often = {"Config": {"Healthcheck": {"Test": ["CMD", "true"], "Interval": 1_000_000, "StartInterval": 1}}}
     asked = body(image=declared("sha256:1", often))["Healthcheck"]
     assert asked == {"Interval": 1_000_000_000, "StartInterval": 1_000_000_000}, "what is checked stays the image's"
+    negative = {"Config": {"Healthcheck": {"Test": ["CMD", "true"], "Interval": -1}}}
+    assert body(image=declared("sha256:1", negative))["Healthcheck"] == {"Interval": 1_000_000_000}, "without a pause"
     for ours in ({"Interval": 5_000_000_000}, {"Interval": 1_000_000_000}, {"Interval": 0}, {}, None):
         assert "Healthcheck" not in body(image=declared("sha256:1", {"Config": {"Healthcheck": ours}}))
+
+
+@pytest.mark.parametrize("test", [["CMD"], ["CMD", ""], ["CMD-SHELL"], ["true"]])
+def test_an_image_whose_health_check_has_no_command_is_not_started(test: list[str]) -> None:
+    """An engine (20.10) ended by the first, and all containers of its machine with it."""
+    with pytest.raises(RuntimeFailure, match="its image declares the health check"):
+        declared("sha256:1", {"Config": {"Healthcheck": {"Test": test}}})
 
 
 def test_an_image_that_declares_thousands_of_volumes_is_not_started() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from skytether.api.grant import GRANT_VARIABLE
+from skytether.api.health_check import is_borne
 from skytether.api.manifest import ServiceSpec
 from skytether.api.service_report import FILE_NAME
 
@@ -162,7 +163,7 @@ def declared(image: str, inspected: Mapping[str, Any]) -> Declared:
         inspected: The description.
 
     Raises:
-        RuntimeFailure: It asks for too much.
+        RuntimeFailure: It asks for too much, or for what ends an engine.
     """
     config = inspected.get("Config") or {}
     volumes, health = tuple(config.get("Volumes") or ()), config.get("Healthcheck") or {}
@@ -172,9 +173,11 @@ def declared(image: str, inspected: Mapping[str, Any]) -> Declared:
     for inner, outer in itertools.permutations(sorted(paths), 2):
         if inner.startswith(f"{outer.rstrip('/')}/"):
             raise RuntimeFailure(f"its image declares volumes so that {inner} is in {outer}; none may be in another")
+    if not is_borne(test := health.get("Test")):
+        raise RuntimeFailure(f"its image declares the health check {str(test)[:80]}, which has no command")
     # Where it says 0 the engine's own holds, half a minute.
     return Declared(
-        image, volumes, {key: least for key, least in _LEAST_BETWEEN_CHECKS.items() if 0 < health.get(key, 0) < least}
+        image, volumes, {key: least for key, least in _LEAST_BETWEEN_CHECKS.items() if 0 != health.get(key, 0) < least}
     )
 
 
