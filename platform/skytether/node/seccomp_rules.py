@@ -1,54 +1,34 @@
 """Whether a seccomp profile holds a container at least as an engine's own does. Pure.
 
-What gives a process a namespace, a file system or a part of the kernel that its container has not must be refused. An
-engine reads keys in any case, and of a key that stands twice both: only exact keys are taken, each of them once, and
-plain names of calls.
+What gives a process a namespace, a file system or a part of the kernel that its container has not must be refused.
+Nobody knows all calls that do, and kernels learn others: none is let through but those of Skytether's own profile, as
+that lets them through. An engine reads keys in any case, and of a key that stands twice both: only exact keys are
+taken, each of them once.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from typing import Any
 
+from .seccomp_calls import CALLS
+
 _REFUSES = {f"SCMP_ACT_{word}" for word in ("ERRNO", "KILL", "KILL_PROCESS", "KILL_THREAD", "TRAP")}
-_WAYS_OUT = {
-    *(
-        "unshare",
-        "setns",
-        "clone3",
-        "mount",
-        "umount",
-        "umount2",
-        "pivot_root",
-        "fsopen",
-        "fsconfig",
-        "fsmount",
-        "fspick",
-    ),
-    *("move_mount", "open_tree", "mount_setattr", "open_by_handle_at", "bpf", "perf_event_open", "userfaultfd"),
-    *("init_module", "finit_module", "delete_module", "create_module", "kexec_load", "kexec_file_load", "reboot"),
-    # Newer engines refuse them, or what they do with others' processes and memory.
-    *("io_uring_setup", "io_uring_enter", "io_uring_register", "process_vm_readv", "process_vm_writev", "kcmp"),
-    *("open_tree_attr", "uselib", "ustat", "sysfs", "_sysctl", "iopl", "ioperm", "lookup_dcookie", "vm86old"),
-    "socketcall",  # whose arguments are in memory, where no filter sees them
-    *("add_key", "keyctl", "request_key", "quotactl", "swapon", "swapoff", "acct", "syslog", "nfsservctl", "vm86"),
-}
-_CALL = re.compile("[a-z_][a-z0-9_]*")
 _NEW_NAMESPACES = 0x7E020000
 """Flags of ``clone``."""
 _FLAGS_SECOND = {"s390", "s390x"}
 """Where they are its second argument."""
 _GUARDS = {"CAP_NET_ADMIN"}
 """What a container may have of rights: an entry for others of them never applies."""
+_NATIVE = {"SCMP_ARCH_X86_64", "SCMP_ARCH_AARCH64"}
+"""For the 32 bits beside them, what makes sockets has its arguments in memory, where no filter sees them."""
+_FAMILIES = {1, 2, 10, 16}
+"""Of sockets: AF_UNIX, AF_INET, AF_INET6, AF_NETLINK. Others lead to the kernel's ciphers, or to the machine below this
+one, which has no network of its own for each container."""
 _ONE_FAMILY = tuple([{"index": 0, "value": family, "op": "SCMP_CMP_EQ"}] for family in (1, 2, 10))
 _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "value": 12, "op": "SCMP_CMP_EQ"}]
 """Arguments of sockets: of AF_UNIX, AF_INET and AF_INET6; and of AF_NETLINK that for netfilter."""
-_AF_ALG, _AF_VSOCK = 38, 40
-"""Families of sockets that newer engines refuse: to the kernel's ciphers, and to the machine below this one, which has
-no network of its own for each container. An `NE` or a `GT` refuses neither: of a family, the kernel reads half of what
-a filter compares."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
 _ARGUMENT = {"index", "value", "valueTwo", "op"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
@@ -60,7 +40,12 @@ def holds(text: str) -> bool:
         profile = json.loads(text, object_pairs_hook=once)
     except (ValueError, RecursionError):
         return False
-    if not isinstance(profile, dict) or profile.keys() - _PROFILE or profile.get("defaultAction") not in _REFUSES:
+    if not isinstance(profile, dict) or profile.keys() - _PROFILE or not _refuses(profile.get("defaultAction")):
+        return False
+    arches, maps = profile.get("architectures") or [], profile.get("archMap") or []
+    if not isinstance(arches, list) or set(map(str, arches)) - _NATIVE:
+        return False
+    if not isinstance(maps, list) or not all(map(_is_alone, maps)):
         return False
     entries = profile.get("syscalls") or []
     return isinstance(entries, list) and all(isinstance(one, dict) and _closed(one) for one in entries)
@@ -73,12 +58,11 @@ def keeps_in(text: str) -> bool:
     name them. A socket for routes names another one by a number, and there is one for the machine's: the other end of
     the container's link is there. By it a container sees, makes, moves and ends links of the machine.
     """
-    profile = json.loads(text)
-    maps = profile.get("archMap") or []
-    # In 32 bits sockets are made by what a filter does not see into.
-    if profile.get("architectures") or not isinstance(maps, list) or not all(map(_is_alone, maps)):
-        return False
-    return all(_makes_few(one) for one in profile.get("syscalls") or [])
+    return all(_makes_few(one) for one in json.loads(text).get("syscalls") or [])
+
+
+def _refuses(action: Any) -> bool:
+    return isinstance(action, str) and action in _REFUSES
 
 
 def _is_alone(arches: Any) -> bool:
@@ -88,9 +72,9 @@ def _is_alone(arches: Any) -> bool:
 
 def _makes_few(entry: Mapping[str, Any]) -> bool:
     names = [*(entry.get("names") or []), entry.get("name")]
-    if entry.get("action") in _REFUSES or not ("socket" in names or "socketcall" in names):
+    if _refuses(entry.get("action")) or "socket" not in names:
         return True
-    return "socketcall" not in names and (entry.get("args") == _OF_FILTERS or entry.get("args") in _ONE_FAMILY)
+    return entry.get("args") == _OF_FILTERS or entry.get("args") in _ONE_FAMILY
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -107,13 +91,12 @@ def _closed(entry: Mapping[str, Any]) -> bool:
         return False
     if includes.keys() - {"caps", "arches", "minKernel"} or not isinstance(includes.get("caps") or [], list):
         return False
-    if entry.get("action") in _REFUSES or set(map(str, includes.get("caps") or [])) - _GUARDS:
+    if _refuses(entry.get("action")) or set(map(str, includes.get("caps") or [])) - _GUARDS:
         return True
     allowed = [*names, *filter(None, [entry.get("name")])]
-    # Another spelling may mean one of them all the same: what looks it up in C ends it at its first zero.
-    if not all(isinstance(name, str) and _CALL.fullmatch(name) for name in allowed):
+    if not all(isinstance(name, str) and name in CALLS for name in allowed):
         return False
-    if _WAYS_OUT & set(allowed) or ("socket" in allowed and not _of_known_families(entry.get("args"))):
+    if "socket" in allowed and not _of_known_families(entry.get("args")):
         return False
     return "clone" not in allowed or _within(entry.get("args"), includes.get("arches"))
 
@@ -124,12 +107,7 @@ def _of_known_families(arguments: Any) -> bool:
     family = found.get(0, {})
     if not given or len(found) != len(arguments) or any(one.keys() - _ARGUMENT for one in given):
         return False  # of two for one place, either is enough
-    value = family.get("value")
-    if type(value) is not int:
-        return False
-    return (family.get("op") == "SCMP_CMP_LT" and value <= _AF_ALG) or (
-        family.get("op") == "SCMP_CMP_EQ" and value < 1 << 32 and value not in (_AF_ALG, _AF_VSOCK)
-    )
+    return family.get("op") == "SCMP_CMP_EQ" and type(family.get("value")) is int and family["value"] in _FAMILIES
 
 
 def _within(arguments: Any, arches: Any) -> bool:
