@@ -26,9 +26,8 @@ _NATIVE = {"SCMP_ARCH_X86_64", "SCMP_ARCH_AARCH64"}
 _FAMILIES = {1, 2, 10, 16}
 """Of sockets: AF_UNIX, AF_INET, AF_INET6, AF_NETLINK. Others lead to the kernel's ciphers, or to the machine below this
 one, which has no network of its own for each container."""
-_ONE_FAMILY = tuple([{"index": 0, "value": family, "op": "SCMP_CMP_EQ"}] for family in (1, 2, 10))
 _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "value": 12, "op": "SCMP_CMP_EQ"}]
-"""Arguments of sockets: of AF_UNIX, AF_INET and AF_INET6; and of AF_NETLINK that for netfilter."""
+"""Arguments of sockets of AF_NETLINK, that for netfilter."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
 _ARGUMENT = {"index", "value", "valueTwo", "op"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
@@ -56,7 +55,8 @@ def keeps_in(text: str) -> bool:
 
     A container is root of the machine's own user namespace, and so its right is one over all networks, where it can
     name them. A socket for routes names another one by a number, and there is one for the machine's: the other end of
-    the container's link is there. By it a container sees, makes, moves and ends links of the machine.
+    the container's link is there. By it a container sees, makes, moves and ends links of the machine. And a socket of
+    another network is that network: one of AF_UNIX, also half of a pair, is given it by whoever is in there.
     """
     return all(_makes_few(one) for one in json.loads(text).get("syscalls") or [])
 
@@ -72,9 +72,8 @@ def _is_alone(arches: Any) -> bool:
 
 def _makes_few(entry: Mapping[str, Any]) -> bool:
     names = [*(entry.get("names") or []), entry.get("name")]
-    if _refuses(entry.get("action")) or "socket" not in names:
-        return True
-    return entry.get("args") == _OF_FILTERS or entry.get("args") in _ONE_FAMILY
+    made = "socketpair" not in names and ("socket" not in names or entry.get("args") == _OF_FILTERS)
+    return made or _refuses(entry.get("action"))
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

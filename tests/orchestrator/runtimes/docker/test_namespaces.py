@@ -17,6 +17,7 @@ from docker_site import DockerSite
 from skytether.orchestrator.runtimes.base import Phase
 from skytether.orchestrator.runtimes.docker import DockerRuntime
 from skytether.orchestrator.runtimes.docker.network import close_off, guard_image
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
 
@@ -130,6 +131,24 @@ def test_one_that_somebody_removed_is_missed_by_no_start(
     until_phase(runtime, Phase.RUNNING)
     (container,) = docker_site.containers()
     assert inspected(container)["HostConfig"]["NetworkMode"] == docker_site.network
+
+
+SOCKETS = """
+for ([1, 1, 0], [2, 2, 0], [10, 2, 0], [16, 3, 0], [16, 3, 12]) {
+    print socket(my $made, $$_[0], $$_[1], $$_[2]) ? 1 : 0;
+}
+print socketpair(my $one, my $other, 1, 2, 0) ? 1 : 0;
+"""
+
+
+def test_a_guard_makes_sockets_for_filters_alone(docker_site: DockerSite, tmp_path: Path) -> None:
+    """By one of AF_UNIX it would be given one of another network, and its right with it."""
+    holding, profile = DockerOptions().guard_security
+    (tmp_path / "guard.json").write_text(profile.removeprefix("seccomp="))
+    held = f"--security-opt={holding}", f"--security-opt=seccomp={tmp_path / 'guard.json'}"
+    right = "--network=none", "--cap-drop=ALL", "--cap-add=NET_ADMIN"
+    image = docker_site.images.name("guard")
+    assert docker("run", "--rm", *right, *held, "--entrypoint=perl", image, "-e", SOCKETS) == "000010"
 
 
 def test_who_loses_its_network_is_not_well(docker_site: DockerSite, runtime: DockerRuntime) -> None:

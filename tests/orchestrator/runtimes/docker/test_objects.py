@@ -535,6 +535,7 @@ def test_the_profile_of_calls_is_an_allow_list_and_another_may_be_named(tmp_path
     (profile,) = (row[8:] for row in of_guards if row.startswith("seccomp="))
     assert holds_all(profile)
     assert keeps_in(profile)
+    assert not keeps_in(options().security[1].removeprefix("seccomp="))
     with pytest.raises(RuntimeFailure, match="seccomp /nowhere"):
         DockerRuntime("edge", tmp_path, options(seccomp="/nowhere"))
 

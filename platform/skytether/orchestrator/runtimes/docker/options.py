@@ -24,7 +24,8 @@ _NO_NETWORKS = ("host", "none", "default")
 
 _PLAIN = frozenset(ascii_letters + digits + "._:-")
 """Characters of a host and of a user; the colon is an IPv6 address's."""
-_AF_NETLINK, _NETLINK_NETFILTER = 16, 12
+_OF_FILTERS = ((0, 16), (2, 12))
+"""Arguments of sockets by their place: AF_NETLINK, NETLINK_NETFILTER."""
 _OURS = str(Path(__file__).with_name("seccomp.json"))
 
 
@@ -38,11 +39,13 @@ def _profile(path: str) -> str:
 
 @functools.cache
 def _guards_profile() -> str:
-    """Ours, and of sockets to the kernel that for netfilter alone: see `skytether.node.seccomp_rules.keeps_in`."""
+    """Ours, and of sockets that to the kernel's netfilter alone: see `skytether.node.seccomp_rules.keeps_in`."""
     profile = json.loads(_profile(_OURS))
+    profile["syscalls"] = [entry for entry in profile["syscalls"] if entry["names"] != ["socket"]]
     for entry in profile["syscalls"]:
-        if entry["names"] == ["socket"] and entry["args"][0]["value"] == _AF_NETLINK:
-            entry["args"].append({"index": 2, "value": _NETLINK_NETFILTER, "op": "SCMP_CMP_EQ"})
+        entry["names"] = [name for name in entry["names"] if name != "socketpair"]
+    arguments = [{"index": at, "value": value, "op": "SCMP_CMP_EQ"} for at, value in _OF_FILTERS]
+    profile["syscalls"].append({"names": ["socket"], "action": "SCMP_ACT_ALLOW", "args": arguments})
     return json.dumps(profile)
 
 
