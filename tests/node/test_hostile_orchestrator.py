@@ -11,16 +11,22 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from node_scene import first_line, program, until
 
 from skytether.api.node import Issued, Link, Linked, Renew, line_of, read_request
 from skytether.node import calls, run
 from skytether.node.store import NodeConfig, NodeError, NodeStore, new_key, request_for
-from skytether.orchestrator.nodes.authority import Authority, pem_of
+from skytether.orchestrator.nodes.authority import KEY, Authority, pem_of
 
 Answers = Callable[[ssl.SSLSocket], object]
 _ROOM = 1 << 14
@@ -123,27 +129,64 @@ def test_of_addresses_that_an_orchestrator_tells_few_are_kept_and_no_odd_one(
     assert not any("\n" in line or "\x1b" in line for line in caplog.messages)
 
 
-@pytest.mark.parametrize("odd", ["nothing", "garbage", "of another key", "by another authority"])
+def odd_certificate(keys: Path, key: ec.EllipticCurvePrivateKey, odd: str) -> str:
+    """What whoever has the authority's key can sign, and no program can use."""
+    authority, signer = Authority(keys, time.time), load_pem_private_key((keys / KEY).read_bytes(), None)
+    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+    names = {"of another name": ["other"], "of two names": ["edge", "edge"]}.get(odd, ["edge"])
+    purpose = ExtendedKeyUsageOID.SERVER_AUTH if odd == "for servers" else ExtendedKeyUsageOID.CLIENT_AUTH
+    ends = datetime.now(UTC) + timedelta(days=-10 if odd == "over long ago" else 30)
+    builder = (
+        x509.CertificateBuilder(public_key=key.public_key(), serial_number=x509.random_serial_number())
+        .issuer_name(authority.certificate.subject)
+        .subject_name(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name) for name in names]))
+        .add_extension(x509.ExtendedKeyUsage([purpose]), critical=True)
+        .not_valid_before(ends - timedelta(days=30))
+        .not_valid_after(ends)
+    )
+    if odd == "with what nobody knows":
+        unknown = x509.UnrecognizedExtension(x509.ObjectIdentifier("1.3.6.1.4.1.99999.1"), b"\5\0")
+        builder = builder.add_extension(unknown, critical=True)
+    return pem_of(builder.sign(signer, hashes.SHA3_256() if odd == "signed oddly" else hashes.SHA256()))
+
+
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        ("nothing", "Unable to load PEM"),
+        ("garbage", "error parsing asn1"),
+        ("of another key", "it is for another key"),
+        ("by another authority", "InvalidSignature"),
+        ("signed oddly", "[SSL"),
+        ("for servers", "unsuitable certificate purpose"),
+        ("of another name", "it is for another name"),
+        ("of two names", "it is for another name"),
+        ("over long ago", "it is over already"),
+        ("with what nobody knows", "unhandled critical extension"),
+    ],
+)
 def test_what_is_no_certificate_of_the_node_takes_its_own_from_nobody(
-    hostile: Hostile, odd: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    hostile: Hostile, odd: str, why: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It would be no site any more, also where the orchestrator is the operator's again."""
     (tmp_path / "false").mkdir()
     false = Authority(tmp_path / "false", time.time)
     key, before = new_key(), hostile.store.identity.read_bytes()
     given = {
-        "nothing": "",
+        "nothing": " ",
         "garbage": "-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",
         "of another key": hostile.issue(new_key()),
         "by another authority": hostile.issue(key, false),
-    }[odd]
-    with pytest.raises(NodeError, match="is not kept"):
+    }.get(odd) or odd_certificate(tmp_path / "keys", key, odd)
+    with pytest.raises(NodeError, match="is not kept") as refused:
         hostile.store.renew(key, given)
+    assert why in str(refused.value)
     hostile.answers[Renew] = lambda link: link.sendall(line_of(Issued(name="edge", certificate=given)))
     hostile.answers[Link] = lambda link: hostile.stay(link, time=time.time() + 1e8)
     with program(hostile.store):
         until(lambda: any("is not kept" in line for line in caplog.messages))
     assert hostile.store.identity.read_bytes() == before
+    run.NodeProgram(hostile.store)  # which it could not be any more
     hostile.store.renew(key, hostile.issue(key))
     assert hostile.store.identity.read_bytes() != before
 

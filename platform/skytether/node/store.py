@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 from cryptography import x509
-from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from pydantic import Field, ValidationError
@@ -16,6 +15,8 @@ from pydantic import Field, ValidationError
 from skytether.api.manifest import Device, Name, Strict
 from skytether.api.node import Address, Port
 from skytether.guard.folder import objection
+
+from .proof import identity, unfit
 
 DEFAULT_FOLDER = Path("/etc/skytether/node")
 _CONFIG, _AUTHORITY, _IDENTITY = "node.json", "authority.pem", "identity.pem"
@@ -116,33 +117,32 @@ class NodeStore:
         """Keep all of it, what says that it is joined last.
 
         Raises:
+            NodeError: Nobody can be known by that certificate.
             OSError: It cannot be written.
         """
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.folder.chmod(0o700)
         self._put(_AUTHORITY, authority.encode())
-        self.renew(key, certificate)
+        self._identify(key, certificate, config.name, 0.0)
         self.save(config)
 
     def renew(self, key: ec.EllipticCurvePrivateKey, certificate: str) -> None:
         """Be known by another key and certificate.
 
         Raises:
-            NodeError: It is not for that key, or not by whom this machine trusts: what is there stays.
+            NodeError: This machine cannot be known by it where it is to be: what is there stays.
             OSError: It cannot be written.
         """
-        try:
-            made = x509.load_pem_x509_certificate(certificate.encode())
-            made.verify_directly_issued_by(x509.load_pem_x509_certificate(self.authority().encode()))
-            good = made.public_key() == key.public_key()
-        except (ValueError, TypeError, InvalidSignature):
-            good = False
-        if not good:
-            raise NodeError("what was sent is no certificate for this machine's key: it is not kept")
-        pem = key.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-        self._put(_IDENTITY, pem + made.public_bytes(serialization.Encoding.PEM))
+        before = self.certificate()
+        begins, ends = before.not_valid_before_utc.timestamp(), before.not_valid_after_utc.timestamp()
+        self._identify(key, certificate, self.config().name, _due(begins, ends))
+
+    def _identify(self, key: ec.EllipticCurvePrivateKey, certificate: str, name: str, until: float) -> None:
+        if why := unfit(certificate, key, name, self.authority(), until):
+            raise NodeError(
+                f"what was sent is no certificate that this machine can be known by ({why}): it is not kept"
+            )
+        self._put(_IDENTITY, identity(key, x509.load_pem_x509_certificate(certificate.encode())))
 
     def clear(self) -> None:
         """Forget all of it."""
@@ -177,4 +177,8 @@ def request_for(key: ec.EllipticCurvePrivateKey) -> str:
 
 def renew_due(begins: float, ends: float, now: float) -> bool:
     """Whether two thirds of a certificate's life are over; all by the orchestrator's clock [s]."""
-    return now >= begins + (ends - begins) * 2 / 3
+    return now >= _due(begins, ends)
+
+
+def _due(begins: float, ends: float) -> float:
+    return begins + (ends - begins) * 2 / 3
