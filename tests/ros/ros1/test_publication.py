@@ -103,22 +103,24 @@ def test_who_begins_to_listen_after_somebody_has_left_counts():
     """Beside a recorder, say, the wheels' node may have been started again; who only comes besides does not count."""
 
     async def work(publication, connect):
-        async def listen(count):
-            _, writer, _ = await connect()
+        async def listen(count, name):
+            _, writer, _ = await connect(callerid=name)
             writers.append(writer)
             while len(publication.subscribers) != count:
                 await asyncio.sleep(0.001)
 
         writers = []
-        await listen(1)
-        await listen(2)
+        await listen(1, "/recorder")
+        await listen(2, "/base")
         assert publication.renewed == 0
         writers[1].close()
         while len(publication.subscribers) != 1:
             await asyncio.sleep(0.001)
-        await listen(2)
-        await listen(3)
-        assert publication.renewed == 1
+        await listen(2, "/echo")  # may be it, by another name
+        await listen(3, "/base")
+        assert publication.renewed == 2
+        await listen(4, "/other")
+        assert publication.renewed == 2
         for writer in writers:
             writer.close()
 

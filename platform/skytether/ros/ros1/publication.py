@@ -12,6 +12,7 @@ from math import inf
 
 from skytether.guard.clock import now as boottime
 from skytether.ros.names import ros1_type
+from skytether.ros.ros2.native.side.comers import Comers
 
 from .tcpros import ANY, pack_frame, pack_header, sums_differ
 
@@ -93,7 +94,7 @@ class Publication:
         topic: Absolute name.
         type: As ROS 1 has it, ``sensor_msgs/LaserScan``.
         md5: Of the type.
-        renewed: How often somebody began to listen after somebody had left, who may be the same.
+        renewed: How often somebody began to listen who may have left before.
     """
 
     def __init__(
@@ -135,8 +136,7 @@ class Publication:
         self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self.renewed = 0
-        self._left = False
-        """Whether somebody has left, and nobody begun to listen since."""
+        self._comers = Comers()
         self._refused: set[tuple[str, str]] = set()
 
     @property
@@ -189,15 +189,14 @@ class Publication:
             until, frame = self._held.popleft()
             if time.monotonic() < until:
                 subscriber.send(frame)
-        self.renewed += self._left
-        self._left = False
         self._subscribers.append(subscriber)
+        self.renewed += self._comers.is_anybody_back(self.subscribers)
         try:
             while await reader.read(4096):
                 pass
         finally:
             self._subscribers.remove(subscriber)
-            self._left = True
+            self._comers.is_anybody_back(self.subscribers)
             subscriber.close()
 
     def _refusal(self, caller: str, header: dict[str, str]) -> str:

@@ -99,6 +99,19 @@ def test_one_stamp_far_in_the_future_is_overcome():
     assert sensor.came(13.0).delay == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("bad", [1, 20])
+def test_nanoseconds_beyond_a_second_are_overcome(bad):
+    """They count as what they are: or stamps in order would have gone back, and good ones come late for ever."""
+    sensor = Sensor()
+    for i in range(50):
+        sensor.came(i / 10)
+    for i in range(50, 50 + bad):
+        sensor.stamps = date(sensor.rule, sensor.stamps, (int(START + i / 10), 2**32 - 1), i / 10, 0.3).stamps
+    begin = 50 + bad
+    dated = [sensor.came(i / 10) for i in range(begin, begin + 40)]
+    assert all(not one.wrong and one.delay == pytest.approx(0.0, abs=1e-3) for one in dated[12:])
+
+
 def test_readings_without_stamps():
     sensor = Sensor()
     assert sensor.unstamped(1.0).wrong == ""

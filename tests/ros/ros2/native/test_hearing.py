@@ -15,10 +15,11 @@ class Publisher:
         self.now = 100.0
 
     def publish(self, listeners, read, ticks=1):
+        """``listeners``: letters, each the name of a node."""
         for _ in range(ticks):
             self.now += TICK
-            self.hearing.update(listeners, read, self.now)
-            self.hearing.tell(listeners, self.now)
+            self.hearing.update(len(listeners), read, self.now, lambda: listeners)
+            self.hearing.tell(len(listeners), self.now)
         return self.hearing
 
 
@@ -28,42 +29,56 @@ def publisher():
 
 
 def test_it_is_heard_once_somebody_has_acknowledged_a_message(publisher):
-    assert not publisher.publish(0, True, 10).heard
-    assert not publisher.publish(1, True).heard, "nothing was published yet"
-    assert publisher.publish(1, True).heard
-    assert not publisher.publish(0, True).heard
+    assert not publisher.publish("", True, 10).heard
+    assert not publisher.publish("b", True).heard, "nothing was published yet"
+    assert publisher.publish("b", True).heard
+    assert not publisher.publish("", True).heard
 
 
 def test_one_who_acknowledges_nothing_counts_as_hearing_after_a_while(publisher):
     ticks = int(HEARS_S / TICK)
-    assert not publisher.publish(1, False, ticks).heard
-    assert publisher.publish(1, False, 3).heard
+    assert not publisher.publish("b", False, ticks).heard
+    assert publisher.publish("b", False, 3).heard
     assert publisher.hearing.unread_s == 0.0, "of one who never did it is not known"
 
 
 def test_how_long_nobody_has_acknowledged_is_known_of_one_who_did(publisher):
-    publisher.publish(1, True, 5)
-    assert publisher.publish(1, False, 10).unread_s == pytest.approx(10 * TICK)
+    publisher.publish("b", True, 5)
+    assert publisher.publish("b", False, 10).unread_s == pytest.approx(10 * TICK)
     assert publisher.hearing.heard
-    assert publisher.publish(1, True).unread_s == 0.0
-    publisher.publish(1, False, 5)
-    publisher.publish(0, True)
-    assert publisher.publish(1, False, 5).unread_s == 0.0, "another one, who has not yet"
+    assert publisher.publish("b", True).unread_s == 0.0
+    publisher.publish("b", False, 5)
+    publisher.publish("", True)
+    assert publisher.publish("b", False, 5).unread_s == 0.0, "another one, who has not yet"
 
 
 def test_who_comes_to_watch_stops_nobody(publisher):
-    publisher.publish(1, True, 5)
-    assert publisher.publish(2, True).heard
-    assert publisher.publish(1, True).heard, "and who goes"
+    publisher.publish("b", True, 5)
+    assert publisher.publish("be", True).heard
+    assert publisher.publish("b", True).heard, "and who goes"
 
 
-@pytest.mark.parametrize("left", [True, False])
-def test_who_comes_in_somebody_s_place_is_to_hear_a_first_word(publisher, left):
-    publisher.publish(2, True, 5)
-    if left:
-        publisher.publish(1, True, 5)
-    else:
-        publisher.publish(2, False, int(SILENT_S / TICK) + 2)
+def test_who_comes_while_nobody_is_heard_is_to_hear_a_first_word(publisher):
+    publisher.publish("rb", True, 5)
+    publisher.publish("rb", False, int(SILENT_S / TICK) + 2)
     assert publisher.hearing.heard
-    assert not publisher.publish(2 if left else 3, False).heard
-    assert publisher.publish(2 if left else 3, True).heard
+    assert not publisher.publish("rbx", False).heard
+    assert publisher.publish("rbx", True).heard
+
+
+@pytest.mark.parametrize(
+    "listeners",
+    [
+        ("rb", "r", "rb"),  # started again
+        ("rb", "r", "rx"),  # by another name
+        ("b", "", "e", "be"),  # somebody else came first
+        ("rb", "r", "re", "reb"),
+        ("b", "bb"),  # killed: its node is shown still
+    ],
+)
+def test_the_wheels_that_are_back_are_to_hear_a_first_word(publisher, listeners):
+    for there in listeners[:-1]:
+        publisher.publish(there, True, 5)
+    assert publisher.hearing.heard == bool(listeners[-2])
+    assert not publisher.publish(listeners[-1], True).heard
+    assert publisher.publish(listeners[-1], True).heard

@@ -201,7 +201,7 @@ class Sensing:
         if not -self._tolerance <= silent <= self._sensors[topic].max_age_s:
             return Sight.STALE, f"silent for {silent:.1f} s"
         if not silent + known.delay <= self._sensors[topic].max_age_s:
-            return Sight.STALE, f"by its stamp it came {known.delay:.1f} s late"
+            return Sight.STALE, f"silent for {silent:.1f} s, and by its stamp it came {known.delay:.1f} s late"
         return known.view.sight, known.view.detail
 
 

@@ -21,6 +21,7 @@ _AGAIN_COUNT = 5
 """And how many there must be."""
 _EVEN_S = 0.25
 """What counts as evenly: stamps and arrivals differ by less from one to the next."""
+_NANO = 1_000_000_000
 _AHEAD_S = 0.05
 """How far ahead of our clock a stamp of it may be: a driver may stamp the end of a turn that is not over yet."""
 
@@ -91,6 +92,7 @@ def date(rule: StampRule, before: Stamps, stamp: Stamp, now: float, max_age: flo
         max_age: Age at which it is stale [s]; one that is later does not become what is usual.
         wall: This computer's clock when it came, as stamps have it [s]; only looked at with `StampRule.OWN`.
     """
+    stamp = stamp[0] + stamp[1] // _NANO, stamp[1] % _NANO  # a driver may count nanoseconds beyond a second
     if stamp == (0, 0):
         missing = rule in (StampRule.REQUIRED, StampRule.OWN) or before.newest is not None
         return Dated(before, wrong="unstamped") if missing else Dated(before)

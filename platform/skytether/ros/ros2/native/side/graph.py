@@ -86,6 +86,11 @@ def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
+def listeners(node: Any, topic: str) -> list[str]:
+    """Nodes that subscribe a topic, once for each subscription; empty where a name is not told, or not yet."""
+    return [_node(info) for info in node.get_subscriptions_info_by_topic(topic)]
+
+
 def others(node: Any) -> tuple[int, int]:
     """How many other nodes there are, and how many of them have our name."""
     nodes = node.get_node_names_and_namespaces()

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection
+
+from .comers import Comers
+
 SILENT_S = 0.5
 """Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 HEARS_S = 3.0
@@ -24,10 +28,9 @@ class Hearing:
         self._told_since: float | None = None
         """Since when somebody listens to what was published [s]."""
         self._listeners = 0
-        self._left = False
-        """Whether somebody listened who does not any more, while others do."""
+        self._comers = Comers()
 
-    def update(self, listeners: int, read: bool, now: float) -> None:
+    def update(self, listeners: int, read: bool, now: float, names: Callable[[], Collection[str]]) -> None:
         """A message is about to be published.
 
         Who always takes longer to acknowledge one than it takes until the next is not known by it, and never counts.
@@ -36,16 +39,16 @@ class Hearing:
             listeners: How many there are.
             read: Whether they have acknowledged all that was published.
             now: Seconds.
+            names: Gives those of their nodes; asked where they are others.
         """
         before, self._listeners = self._listeners, listeners
+        back = listeners != before and self._comers.is_anybody_back(names())
         if not listeners:
-            self.heard, self._told_since, self._left = False, None, False
-        elif listeners < before:
-            self._left = True
-        elif listeners > before and (self._left or self.unread_s > SILENT_S):
-            # The wheels' node may have been started again, beside a recorder.
-            self.heard, self._told_since, self._left = False, now, False
-        elif self._told_since is not None and (read or now - self._told_since > HEARS_S):
+            self.heard, self._told_since = False, None
+        elif listeners > before and (back or self.unread_s > SILENT_S):
+            # The wheels' node may have been started again, beside somebody else.
+            self.heard, self._told_since = False, now
+        elif listeners >= before and self._told_since is not None and (read or now - self._told_since > HEARS_S):
             self.heard = True
         if read:
             self._read_at = now if listeners else None

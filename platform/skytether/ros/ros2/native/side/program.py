@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -221,7 +222,8 @@ class Program:
             publisher, hearing = self._publishers.get(frame.channel), self._hearing.get(frame.channel, Hearing())
             if publisher is not None:
                 read = _has_been_read(publisher)
-                hearing.update(publisher.get_subscription_count(), read, _now())
+                names = partial(graph.listeners, self._node, publisher.topic_name)
+                hearing.update(publisher.get_subscription_count(), read, _now(), names)
                 if _now() <= until and (hearing.heard or not heeds):  # or he is new, and it is no first word for him
                     publisher.publish(body)
                     self._published[frame.channel] = self._published.get(frame.channel, 0) + 1

@@ -1,0 +1,39 @@
+"""Who begins to listen to a topic, and may be somebody who is back: the wheels' node, started again. Pure."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+
+MOST = 256
+"""Names of those who left that are known."""
+
+
+class Comers:
+    """Knows who listens to one topic, by the names of nodes."""
+
+    def __init__(self) -> None:
+        self._here: Counter[str] = Counter()
+        self._away: dict[str, None] = {}
+        """Who left and has not come back, the one who left first at first."""
+
+    def is_anybody_back(self, names: Collection[str]) -> bool:
+        """Whether somebody came who may have been there before.
+
+        Whoever comes may be one who left by another name. A name that is there twice is of one who was killed, too, and
+        whose node the graph still shows.
+
+        Args:
+            names: Of all who listen now, one for each subscription; empty where it is not known.
+        """
+        here = Counter(names)
+        came, gone = here - self._here, self._here - here
+        known = [name for name in gone if name]
+        self._away |= dict.fromkeys(known)
+        back = bool(came) and (bool(self._away) or any(not name or name in self._here for name in came))
+        for name in came:
+            self._away.pop(name, None)
+        while len(self._away) > MOST:
+            del self._away[next(iter(self._away))]
+        self._here = here
+        return back

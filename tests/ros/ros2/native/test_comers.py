@@ -1,0 +1,30 @@
+"""Who begins to listen, and may be the wheels' node that was started again."""
+
+import pytest
+
+from skytether.ros.ros2.native.side.comers import MOST, Comers
+
+
+@pytest.mark.parametrize(
+    ("ways", "back"),
+    [
+        ([[], ["/base"], ["/base", "/echo"], ["/base"]], []),
+        ([["/base"], [], ["/base"]], [2]),
+        ([["/base"], [], ["/echo"], ["/echo", "/base"], ["/base"], ["/base", "/new"]], [2, 3, 5]),
+        ([["/base"], ["/base", "/base"], ["/base"]], [1]),  # killed, and still shown
+        ([["/base"], ["/base", ""]], [1]),  # it is not known yet who that is
+        ([["/base"], ["/base", ""], ["/base", "/echo"]], [1]),  # and now it is
+        ([["/base", "/base"], ["/base"], ["/base", "/base"]], [2]),  # a subscription made anew
+    ],
+)
+def test_who_may_be_back(ways, back):
+    comers = Comers()
+    assert [number for number, names in enumerate(ways) if comers.is_anybody_back(names)] == back
+
+
+def test_of_those_who_left_some_are_known():
+    comers = Comers()
+    for number in range(2 * MOST):
+        comers.is_anybody_back([f"/n{number}"])
+    comers.is_anybody_back([])
+    assert comers.is_anybody_back(["/other"])
