@@ -11,7 +11,7 @@ from skytether.control.admittance import STANDSTILL, Velocity
 from skytether.messages import Twist, Vector3, WrenchStamped, decode, encode
 from skytether.robot.control.arbiter import LinkRequirements, Reason
 from skytether.robot.control.command import Source
-from skytether.robot.control.control_loop import ControlLoop
+from skytether.robot.control.control_loop import ControlLoop, WheelsStandError
 from skytether.robot.control.fallback import Admittance, Stop
 from skytether.robot.control.service_manager import Terms, terms
 from skytether.robot.control.supervisor import VelocityLimits
@@ -399,6 +399,20 @@ def test_wheels_that_cannot_be_written_are_tried_again(driven):
     driven.base.on_write = lambda: None
     driven.run(TICK, linear=0.2)
     assert driven.base.velocity == pytest.approx((0.2, 0.0), abs=0.11)
+
+
+def test_wheels_that_were_told_to_stand_go_on_from_there(driven):
+    def stand():
+        raise WheelsStandError("their node does not hear us")
+
+    driven.run(1.0, linear=0.2)
+    driven.base.on_write = stand
+    driven.run(0.05, linear=0.2)
+    driven.base.on_write = lambda: None
+    driven.base.written.clear()
+    driven.run(5 * TICK, linear=0.2)
+    first, *_, last = [linear for linear, _ in driven.base.written]
+    assert 0.0 < first < last < 0.1
 
 
 def test_a_bridge_that_raises_costs_the_cloud_a_reading_only(driven, bridge, monkeypatch):

@@ -62,6 +62,10 @@ _TRANSITIONS_KEPT = 1000
 """The newest; all are counted."""
 
 
+class WheelsStandError(ConnectionError):
+    """The wheels were told to stand, in place of what they were to do."""
+
+
 class RobotHardware(Protocol):
     """The robot's own hardware, or a simulation of it. Both calls must return within a fraction of a tick.
 
@@ -77,7 +81,11 @@ class RobotHardware(Protocol):
         ...
 
     def write(self, twist: Twist) -> None:
-        """What the wheels are to do until the next call."""
+        """What the wheels are to do until the next call.
+
+        Raises:
+            WheelsStandError: They were told to stand; the loop goes on from there. Whatever else is raised is counted.
+        """
         ...
 
 
@@ -434,6 +442,8 @@ class ControlLoop:
             self._hardware.write(Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular)))
             self._written_at = self._now
         except Exception as error:  # tried again at the next tick
+            if isinstance(error, WheelsStandError):
+                self._supervised = replace(self._supervised, velocity=STANDSTILL)  # from there it goes on
             self._caught("write", error)
 
     def _caught(self, part: str, error: Exception) -> None:

@@ -19,7 +19,7 @@ from skytether.ros.followed import Followed
 from skytether.ros.names import Names, resolve
 from skytether.wire.topic import Topic
 
-from ..control.control_loop import RobotHardware
+from ..control.control_loop import RobotHardware, WheelsStandError
 
 _log = logging.getLogger(__name__)
 
@@ -155,7 +155,7 @@ class GraphBase:
             self._stood_since = None  # a standstill lasts from when the wheels were told of it
             raise
         if taken and told != twist:
-            raise ConnectionError("the wheels are told to stand until their node listens and hears us")
+            raise WheelsStandError("the wheels are told to stand until their node listens and hears us")
 
 
 _STANDSTILL = Twist()
