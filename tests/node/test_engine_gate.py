@@ -66,6 +66,8 @@ class Engine:
         """Others that it has."""
         self.others: dict[str, dict[str, Any]] = {}
         """What orchestrators have, beside the one container: by ids and names what is said of it."""
+        self.unlisted = False
+        """It lists no containers."""
         self.slow: dict[str, threading.Event] = {}
         """By what it is asked, what it waits for before it answers."""
         self.file = b""
@@ -88,7 +90,10 @@ class Engine:
                         waits.wait(20)
                 other = next((one for one in engine.others if one in self.path), None)
                 labels = {"skytether.io/owner": "edge"} if ID in self.path or other else {}
+                runs = any(one in self.path for one in engine.running)
+                state = {"Running": runs, "Status": "running" if runs else "created"}
                 said = {"Id": ID, "Config": {"Labels": labels}, "Labels": labels, "Image": "a", **engine.container}
+                said["State"] = state
                 if other:
                     said |= {"Id": other, **engine.others[other]}
                 if "/system/df" in self.path:
@@ -100,9 +105,8 @@ class Engine:
                 if self.path.startswith("/networks?"):
                     text = json.dumps([{"Name": name} for name in engine.networks]).encode()
                 if self.path.startswith("/containers/json"):
-                    there = engine.running | (engine.idle if "all=1" in self.path else set())
-                    wanted = json.loads(parse_qs(urlsplit(self.path).query)["filters"][0]).get("id", there)
-                    text = json.dumps([{"Id": one} for one in there & set(wanted)]).encode()
+                    there = set() if engine.unlisted else engine.running | engine.idle
+                    text = json.dumps([{"Id": one} for one in there]).encode()
                 if self.path == "/volumes":
                     text = json.dumps({"Volumes": engine.volumes}).encode()
                 if engine.networks and self.command == "GET" and (name := self.path.partition("/networks/")[2]):
@@ -202,7 +206,7 @@ def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine
     assert sorted(engine.lines[:-1]) == [looked, "GET /v1.41/info"]  # which of them first, the engine's threads say
     assert engine.lines[-1] == f"POST /v1.41/containers/{ID}/update"
     _, headers, got = engine.asked[-1]
-    assert {name.lower() for name in headers} == {"host", "content-length", "content-type"}
+    assert {name.lower() for name in headers} == {"accept-encoding", "host", "content-length", "content-type"}
     assert got == b'{"Memory": 2}'
 
 
@@ -319,11 +323,11 @@ def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -
             await asyncio.sleep(0)
             if reader._waiter is not None:  # type: ignore[attr-defined]  # noqa: SLF001
                 break
-        engine_s.write.assert_not_called()
+        assert not engine.lines
         reader.feed_data(sent[-1:])
         reader.feed_eof()
         await way
-        assert engine_s.write.call_args.args[0].endswith(archive)
+        assert engine.asked[-1][2] == archive
 
     asyncio.run(run())
 
@@ -852,6 +856,64 @@ def test_a_start_waits_some_time_for_a_removal_and_is_told(engine: Engine, monke
         await site.start(Y)
 
     asyncio.run(run())
+
+
+def test_an_engine_s_list_is_not_believed_of_who_runs(engine: Engine) -> None:
+    """With a full disk one (20.10) starts a container that its list never says to run."""
+    engine.others = {X: in_volumes(OWN, "skytether-s"), Y: in_volumes("skytether-s"), OWN: {}}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        await site.start(Y)
+        engine.unlisted = True
+        await site.ask(f"DELETE /v1.41/containers/{X}?v=1&force=1")
+        engine.running.discard(X)
+        assert b"409 Conflict" in await site.ask(f"DELETE /v1.41/volumes/{OWN}")
+        assert site.removed == [f"containers/{X}?force=1"]
+
+    asyncio.run(run())
+
+
+def test_whose_network_is_joined_is_paused_meanwhile_and_not_ended(engine: Engine) -> None:
+    """By the number of its process an engine names the network: once that has ended, one of the machine may have it."""
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}"), Z: in_volumes(network=f"container:{X}")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        starts, ends = f"POST /v1.41/containers/{Y}/start", f"POST /v1.41/containers/{X}/kill?signal=KILL"
+        engine.slow[starts] = threading.Event()
+        way = asyncio.create_task(site.start(Y))
+        await site.soon(starts)
+        for ending in (ends, f"DELETE /v1.41/containers/{X}?force=1", f"DELETE /v1.41/containers/{X}?v=1&force=1"):
+            assert b"another container is just joining its network" in await site.ask(ending)
+        other = asyncio.create_task(site.start(Z))
+        engine.slow[starts].set()
+        await asyncio.gather(way, other)
+        pause, unpause = f"POST /containers/{X}/pause", f"POST /containers/{X}/unpause"
+        done = [line for line in engine.lines if line in (pause, starts, unpause)]
+        assert done[:3] == [pause, starts, unpause]
+        assert [line for line in engine.lines if line.endswith("pause")] == [pause, unpause] * 2, "one after the other"
+        engine.slow[ends] = threading.Event()
+        ended = asyncio.create_task(site.ask(ends))
+        await site.soon(ends)
+        engine.running -= {Y}
+        assert b"whose network it joins is being ended" in await site.ask(starts)
+        engine.slow[ends].set()
+        assert b"200 OK" in await ended
+
+    asyncio.run(run())
+
+
+def test_what_is_put_into_a_container_is_put_there_before_it_was_ever_started(engine: Engine) -> None:
+    """As the engine writes it, what runs there makes it a link to a device."""
+    archive = tar(*GRANT, ("instance/grant.json", FILE, b"a"))
+    puts = request(f"PUT /v1.41/containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
+    assert b"200 OK" in say(engine, puts)
+    engine.running = {ID}
+    assert b"before it was ever started" in say(engine, puts)
+    assert len([line for line in engine.lines if line.startswith("PUT")]) == 1
 
 
 def test_what_has_ended_is_forgotten_before_there_is_no_room_for_more(engine: Engine) -> None:

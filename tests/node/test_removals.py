@@ -41,7 +41,7 @@ class Gated:
     def labels(self) -> dict[str, str]:
         return {"skytether.io/owner": self.name}
 
-    def make(self, *shared: str) -> tuple[str, str]:
+    def make(self, *shared: str, network: str = "") -> tuple[str, str]:
         """A container that runs, and the volume that it alone has."""
         mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": {"Labels": self.labels}}] + [
             {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {"NoCopy": True}} for one in shared
@@ -51,7 +51,7 @@ class Gated:
             "Entrypoint": ["sleep", "600"],
             "Labels": self.labels,
             "HostConfig": {
-                "NetworkMode": self.name,
+                "NetworkMode": network or self.name,
                 "CapDrop": ["ALL"],
                 "SecurityOpt": ["no-new-privileges"],
                 "ReadonlyRootfs": True,
@@ -132,7 +132,7 @@ def test_files_are_removed_when_nobody_runs_who_may_have_a_folder_of_them(gated:
     options = {"com.docker.network.bridge.name": f"skt-{gated.name[-8:]}"}
     network = {"Name": gated.name, "CheckDuplicate": True, "Driver": "bridge", "Options": options}
     # It looks back first: what others run at this engine meets nothing that is made here.
-    assert gated.ask(f"DELETE /volumes/{gated.name}-none").status == HTTPStatus.NOT_FOUND
+    assert gated.ask(f"DELETE /volumes/{secrets.token_hex(32)}").status == HTTPStatus.NOT_FOUND
     made = gated.ask("POST /networks/create", {**network, "Labels": {"skytether.io/network": "filtered"}})
     assert made.status == HTTPStatus.CREATED, made.content
     shared = f"{gated.name}-shared"
@@ -154,3 +154,17 @@ def test_files_are_removed_when_nobody_runs_who_may_have_a_folder_of_them(gated:
     assert not gated.has(own)
     assert gated.ask(f"DELETE /containers/{other}?v=1").status == HTTPStatus.NO_CONTENT
     assert not gated.has(others)
+
+
+def test_whose_network_another_one_joins_goes_on_after_that(gated: Gated) -> None:
+    """It is paused meanwhile."""
+    options = {"com.docker.network.bridge.name": f"skt-{gated.name[-8:]}"}
+    network = {"Name": gated.name, "CheckDuplicate": True, "Driver": "bridge", "Options": options}
+    network["Labels"] = {"skytether.io/network": "filtered"}
+    assert gated.ask("POST /networks/create", network).status == HTTPStatus.CREATED
+    holds, _ = gated.make()
+    joins, _ = gated.make(network=f"container:{holds}")
+    states = [json.loads(gated.ask(f"GET /containers/{one}/json").content)["State"] for one in (holds, joins)]
+    assert [state["Status"] for state in states] == ["running", "running"]
+    assert gated.ask(f"POST /containers/{holds}/kill?signal=KILL").status == HTTPStatus.NO_CONTENT
+    assert gated.ask(f"DELETE /containers/{joins}?force=1").status == HTTPStatus.NO_CONTENT

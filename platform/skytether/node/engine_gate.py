@@ -13,6 +13,7 @@ import logging
 import re
 import time
 from collections.abc import Awaitable
+from functools import partial
 from http import HTTPStatus
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlencode
@@ -77,6 +78,8 @@ _MADE_S, _MOST_NETWORKS = 60.0, 12
 take them all has addresses that the machine knows elsewhere."""
 _MAKES = ("/containers/create", "/volumes/create")
 _JSON, _TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
+_END_S = 60.0
+"""What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S, _MOST_WEIGHED = 300.0, 32 << 20
 """What an engine may take to say how large all is that it has: seconds, and bytes."""
 
@@ -170,7 +173,7 @@ class EngineGate:
                     raise RefusedCall("its archive has something else than folders of ours and a grant")
                 body = made
             target = path + (f"?{urlencode(query)}" if query else "")
-            if answered := self._answered(call, path, target):
+            if answered := self._answered(call, path, target, body if archive else b""):
                 await _answer(back, *await answered)
                 return
             if not archive:
@@ -181,13 +184,14 @@ class EngineGate:
             writer.write(head + passed + b"\r\n" + body)
             await writer.drain()
 
-    def _answered(self, call: Call, way: str, target: str) -> Awaitable[tuple[int, bytes, str]] | None:
+    def _answered(self, call: Call, way: str, target: str, archive: bytes) -> Awaitable[tuple[int, bytes, str]] | None:
         """What is asked of the engine by us, who then answer in its place; None: it answers itself.
 
         Args:
             call: What is asked.
             way: Its path, as it was written.
             target: With the query.
+            archive: That is put into a container.
         """
         path = plain(call.path)
         _, kind, name = (*path.split("/"), "", "")[:3]
@@ -199,13 +203,21 @@ class EngineGate:
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
             return self._file(target)
+        if path.endswith("/archive") and call.method == "PUT":
+            return self._put(name, target, archive)
         if kind == "containers" and path.endswith("/start"):
             return self._start(name, target)
         if call.method == "DELETE" and kind == "volumes":
             return self._kept(self._removals.remove_volume(name, target))
-        if call.method == "DELETE" and kind == "containers" and "v" in call.query:
+        if call.method == "DELETE" and kind == "containers":
             rest = urlencode({key: value for key, value in call.query.items() if key != "v"})
-            return self._kept(self._removals.remove_container(name, target, f"{way}?{rest}"))
+            if "v" in call.query:
+                removes = partial(self._removals.remove_container, name, target, f"{way}?{rest}")
+                return self._kept(self._removals.end(name, removes))
+            return self._kept(self._removals.end(name, partial(self._ask, target, method="DELETE", patience=_END_S)))
+        if kind == "containers" and path.endswith(("/kill", "/update")):
+            asks = partial(self._ask, target, method="POST", body=call.body, patience=_END_S)
+            return self._kept(self._removals.end(name, asks))
         return None
 
     async def _check(self, call: Call) -> None:
@@ -289,6 +301,12 @@ class EngineGate:
     async def _start(self, container: str, target: str) -> tuple[int, bytes, str]:
         found = await self._may_be_started(container)
         return await self._kept(self._removals.start(container, found, target))
+
+    async def _put(self, container: str, target: str, archive: bytes) -> tuple[int, bytes, str]:
+        done = await self._tried(self._removals.put(container, target, archive))
+        if done is None:
+            raise RefusedCall("what is put into a container is put there before it was ever started")
+        return done.status, done.content, _JSON
 
     async def _kept(self, answer: Awaitable[Answer]) -> tuple[int, bytes, str]:
         """Of what was started or removed."""

@@ -41,6 +41,11 @@ class Kin:
             self._groups.update(dict.fromkeys(small, met))
             self._groups[thing] = met
 
+    def leave(self, container: str) -> None:
+        """It does not run: it holds nothing, and its kin need not be asked for it any more."""
+        if (group := self._groups.pop(container, None)) is not None:
+            group.discard(container)
+
     def all(self) -> Set[str]:
         """That are known."""
         return self._groups.keys()

@@ -135,7 +135,7 @@ def ask(
         connection.close()
 
 
-async def ask_long(path: str, what: str, *, method: str) -> Answer:
+async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -> Answer:
     """One call that an engine may take any time for; of its answer there is the status, and what is in it.
 
     It takes no thread meanwhile: these are few.
@@ -144,6 +144,7 @@ async def ask_long(path: str, what: str, *, method: str) -> Answer:
         path: Of the engine's socket.
         what: Path and query.
         method: As HTTP names it.
+        archive: Sent, unless it is empty.
 
     Raises:
         OSError: It does not answer.
@@ -152,7 +153,9 @@ async def ask_long(path: str, what: str, *, method: str) -> Answer:
     reader, writer = await asyncio.open_unix_connection(path)
     try:
         # By this version an engine says no more than one answer, in one piece.
-        writer.write(f"{method} {what} HTTP/1.0\r\nHost: engine\r\nContent-Length: 0\r\n\r\n".encode())
+        kind = "Content-Type: application/x-tar\r\n" if archive else ""
+        asked = f"{method} {what} HTTP/1.0\r\nHost: engine\r\n{kind}Content-Length: {len(archive)}\r\n\r\n"
+        writer.write(asked.encode() + archive)
         said = b""
         while len(said) < _MOST and (piece := await reader.read(_MOST - len(said))):
             said += piece

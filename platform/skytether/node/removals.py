@@ -8,9 +8,12 @@ can make it one, though no path leads there for him. So while kin of a volume ru
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
 import re
-from collections.abc import Collection, Coroutine, Iterable, Mapping
+from collections import Counter
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from http import HTTPStatus
 from typing import Any, TypeVar
 from urllib.parse import urlencode
@@ -19,21 +22,23 @@ from .engine_rules import OWNER
 from .kin import Kin
 from .machine import Answer, ask, ask_long
 
+log = logging.getLogger(__name__)
+
 _T = TypeVar("_T")
 _MOST_TOLD = 32 << 20
 """Bytes of what an engine says of many containers, or of all volumes."""
-_CHUNK = 200
-"""Containers that are asked for at a time: their ids are a part of the query."""
 _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
 _SETTLED_S = 3.0
 """For an engine to say what a container is that it does not start just now."""
+_GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
+"""Between tries to have a container go on that was paused."""
+_OWN = re.compile("[0-9a-f]{64}")
+"""Names of volumes that one container has, and no other can ask for."""
 _MOST_STARTS, _MOST_REMOVALS = 512, 128
 """Under way at a time: an engine may take its time for each, and whoever asked may be gone meanwhile."""
 _VOLUME = "volume "
 """What volumes are known by, before their names: they may be named as containers are."""
-_OWN = re.compile("[0-9a-f]{64}")
-"""Names of volumes that one container has, and no other can ask for."""
 
 
 class BusyError(Exception):
@@ -60,6 +65,14 @@ class Removals:
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
         """Containers that this program had started: whom those meet that another one started, it does not see."""
+        self._puts: set[str] = set()
+        """Containers into which something is being put."""
+        self._joined: Counter[str] = Counter()
+        """How many join the network of each just now."""
+        self._pauses: dict[str, asyncio.Lock] = {}
+        """They do one at a time."""
+        self._ending: Counter[str] = Counter()
+        """Of calls by which a container may end."""
         self._noted = 0
         """Starts, so far."""
         self._removals: dict[asyncio.Task[Answer | None], Collection[str]] = {}
@@ -75,15 +88,81 @@ class Removals:
         # From here to the task nobody else comes between.
         if not self._kin.has_room(things) or len(self._starts) >= _MOST_STARTS:
             raise BusyError("too many containers run or start, with too many volumes")
+        if container in self._puts:
+            raise BusyError("something is being put into it")
+        (joined,) = _joined(inspected) or ("",)
+        if joined in self._ending:
+            raise BusyError("the container whose network it joins is being ended")
         self._kin.meet(things)
         self._mine.add(container)
         if len(self._mine) > len(self._kin):
             self._mine &= self._kin.all()  # who runs is among these
         self._noted += 1
         if (task := self._starts.get(container)) is None:
-            task = self._starts[container] = _begun(ask_long(self._engine, path, method="POST"))
+            if joined:
+                self._joined[joined] += 1
+            task = self._starts[container] = _begun(self._start(path, joined))
             task.add_done_callback(lambda _: self._starts.pop(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
+
+    async def _start(self, path: str, joined: str) -> Answer:
+        """With the one whose network it joins paused meanwhile; empty: it has its own.
+
+        An engine names that network by the number of a process. If that ended before runc looks, another process could
+        have its number: one of the machine, whose network the container would be in.
+        """
+        if not joined:
+            return await ask_long(self._engine, path, method="POST")
+        try:
+            async with self._pauses.setdefault(joined, asyncio.Lock()):
+                try:
+                    held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
+                    if held.status >= HTTPStatus.BAD_REQUEST:
+                        return held  # it has ended, or is about to
+                    return await ask_long(self._engine, path, method="POST")
+                finally:
+                    await self._go_on(joined)
+        finally:
+            self._joined[joined] -= 1
+            if not self._joined[joined]:
+                del self._joined[joined], self._pauses[joined]
+
+    async def _go_on(self, container: str) -> None:
+        for wait_s in _GO_ON_S:
+            await asyncio.sleep(wait_s)
+            with contextlib.suppress(OSError, ValueError):
+                answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
+                    return
+        log.error("container %s stays paused: docker unpause %s", container, container)
+
+    async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
+        """Have something done by which a container may end, which it must not while another one joins its network."""
+        if container in self._joined:
+            raise BusyError("another container is just joining its network")
+        self._ending[container] += 1
+        try:
+            return await work()
+        finally:
+            self._ending[container] -= 1
+            if not self._ending[container]:
+                del self._ending[container]
+
+    async def put(self, container: str, path: str, archive: bytes) -> Answer | None:
+        """Have the engine unpack an archive in one that was never started; None: it was.
+
+        An engine writes through a link to a device that what runs there makes meanwhile.
+        """
+        await self.look_back()
+        status = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
+        state = json.loads(status.content).get("State") or {} if status.status == HTTPStatus.OK else {}
+        if container in self._mine or state.get("Status") != "created":
+            return None
+        self._puts.add(container)
+        try:
+            return await ask_long(self._engine, path, method="PUT", archive=archive)
+        finally:
+            self._puts.discard(container)
 
     async def remove_container(self, container: str, path: str, without: str) -> Answer:
         """Have the engine remove one, with its volumes if nobody else can have a folder of these.
@@ -129,8 +208,8 @@ class Removals:
         return await asyncio.shield(task)
 
     async def _remove(self, things: Collection[str], path: str, itself: str, *, named: bool) -> Answer | None:
-        kin, starting = self._kin.of(things), set(self._starts)
-        if kin & (starting | (await self._running(kin) - {itself})) or (named and await self._strangers_run()):
+        kin, starting = set(self._kin.of(things)), set(self._starts)
+        if kin & (starting | await self._running(kin - {itself})) or (named and await self._strangers_run()):
             return None
         answer = await ask_long(self._engine, path, method="DELETE")
         if answer.status < HTTPStatus.BAD_REQUEST:
@@ -165,46 +244,56 @@ class Removals:
     async def _learn(self) -> None:
         if self._looked_back:  # meanwhile
             return
-        if old := await self._running_or_starting():
+        if old := {one for one in await self._listed() if await self._may_run(one)}:
+            for container in old:  # an earlier program may have ended while it had one paused
+                with contextlib.suppress(OSError, ValueError):
+                    await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
             volumes = (await self._told("/volumes"))["Volumes"] or ()
             self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
         self._looked_back = True
 
-    async def _running_or_starting(self) -> set[str]:
-        """A start that an earlier program asked for may be under way: an engine says nothing of it meanwhile.
-
-        If it takes longer, all that may start are taken for such.
-        """
-        ours = {"label": [OWNER]}
-        idle = await self._listed(ours, "all=1&") - await self._listed(ours)
-        for container in idle:
-            try:
-                await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
-            except (OSError, ValueError):
-                return idle | await self._listed(ours)
-        return await self._listed(ours)
-
     async def _running(self, things: Iterable[str]) -> set[str]:
-        """Those of these containers that run; all, where an engine says so much of them that nobody reads it."""
-        containers, found = [one for one in things if not one.startswith(_VOLUME)], set[str]()
+        """Those of these containers that run, or may."""
+        found = set[str]()
         async with self._looking:  # one at a time, or much that is kin would take all threads
-            for first in range(0, len(containers), _CHUNK):
-                chunk = containers[first : first + _CHUNK]
-                try:
-                    found |= await self._listed({"id": chunk, "label": [OWNER]})
-                except ValueError:
-                    found |= set(chunk)
+            for container in [one for one in things if not one.startswith(_VOLUME)]:
+                noted = self._noted
+                if await self._may_run(container) or noted != self._noted:  # or it may have been started since
+                    found.add(container)
+                elif container not in self._starts:
+                    self._kin.leave(container)
         return found
 
+    async def _may_run(self, container: str) -> bool:
+        """Each is asked for: with a full disk, an engine (20.10) may start one that its list never says to run.
+
+        It says nothing of one that it starts just now, as an earlier program may have asked it to.
+        """
+        try:
+            answer = await asyncio.to_thread(
+                ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S, most=_MOST_TOLD
+            )
+            if answer.status == HTTPStatus.NOT_FOUND:
+                return False
+            return json.loads(answer.content)["State"]["Running"] is not False
+        except (OSError, ValueError, LookupError, TypeError):
+            return True
+
     async def _strangers_run(self) -> bool:
+        """Whether any runs that another program of a node started: whom that has met nobody here has seen."""
         async with self._looking:
             try:
-                return not await self._listed({"label": [OWNER]}) <= self._mine
+                strangers = await self._listed() - self._mine
             except ValueError:
                 return True
+            for container in strangers:
+                if await self._may_run(container):
+                    return True
+        return False
 
-    async def _listed(self, filters: Mapping[str, list[str]], more: str = "") -> set[str]:
-        asked = more + urlencode({"filters": json.dumps(filters)})
+    async def _listed(self) -> set[str]:
+        """All containers of orchestrators."""
+        asked = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
         return {str(one["Id"]) for one in await self._told(f"/containers/json?{asked}")}
 
     async def _told(self, path: str) -> Any:

@@ -424,7 +424,7 @@ def test_ends_are_told_apart(state: dict[str, Any], status: int, detail: str) ->
 
 
 def test_a_failed_health_check_is_told_in_its_own_words() -> None:
-    log = [{"Output": "fine\n"}, {"Output": "the service's loop has hung for 12 s\n"}]
+    log = [{"ExitCode": 0, "Output": "fine\n"}, {"ExitCode": 1, "Output": "the service's loop has hung for 12 s\n"}]
     seen = parse(described(Health={"Status": "unhealthy", "Log": log}))
     assert seen is not None
     assert seen.ill == "the service's loop has hung for 12 s"
@@ -434,6 +434,10 @@ def test_a_failed_health_check_is_told_in_its_own_words() -> None:
     late = parse(described(Health={"Status": "unhealthy", "Log": [*log, {"ExitCode": -1, "Output": "exceeded (3s)"}]}))
     assert late is not None
     assert late.ill == "", "nobody who runs is started again because the machine is busy"
+    for before in ([], log[:1]):  # an engine says so of one that was paused
+        paused = parse(described(Health={"Status": "unhealthy", "Log": before}))
+        assert paused is not None
+        assert paused.ill == ""
     for status in ("starting", "healthy"):
         well = parse(described(Health={"Status": status, "Log": log}))
         assert well is not None

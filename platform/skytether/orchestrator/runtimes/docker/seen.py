@@ -135,11 +135,14 @@ def parse_helper(inspected: Mapping[str, Any]) -> Helper | None:
 
 
 def _complaint(log: Sequence[Mapping[str, Any]]) -> str:
-    """What the last check said; empty: it did not end in time, for which a busy machine is enough."""
-    if log and log[-1].get("ExitCode", 0) < 0:
+    """What the last check said; empty: none has failed.
+
+    One that did not end in time has not, for a busy machine is enough for that. Of a container that was paused an
+    engine says that it is unhealthy, whatever its checks said.
+    """
+    if not log or log[-1].get("ExitCode", 0) <= 0:
         return ""
-    said = last_line(str(log[-1].get("Output", ""))) if log else ""
-    return said or "its health check fails"
+    return last_line(str(log[-1].get("Output", ""))) or "its health check fails"
 
 
 def carried_over(new: ContainerState, old: ContainerState | None) -> ContainerState:
