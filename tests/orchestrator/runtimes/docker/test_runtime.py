@@ -304,14 +304,15 @@ def test_a_volume_of_which_another_container_may_have_a_folder_stays_until_that_
     for instance in ("i1", "i2"):  # of one service and one robot: they have a volume of data in common
         runtime.start(launch(docker_site, instance))
         until_phase(runtime, Phase.RUNNING, instance)
-    assert len(docker_site.volumes()) == 3
+    assert len(docker_site.volumes_with("skytether.io/instance")) == 2
     runtime.remove("i1")
     assert len(docker_site.containers()) == 1
     remove_left(runtime.engine, docker_site.owner)
-    assert len(docker_site.volumes()) == 3
+    assert len(docker_site.volumes_with("skytether.io/instance=i1")) == 1
     runtime.remove("i2")
-    assert len(docker_site.volumes()) == 2, "its own went with it"
+    assert docker_site.volumes_with("skytether.io/instance=i2") == [], "its own went with it"
     remove_left(runtime.engine, docker_site.owner)
+    assert docker_site.volumes_with("skytether.io/instance") == []
     assert len(docker_site.volumes()) == 1, "that of data"
 
 
