@@ -59,13 +59,12 @@ def test_what_is_sent_again_later_is_old_where_it_is_told_when_it_was_published(
     assert not process.take(2.5), "a publisher's clock was put back; there was no stall"
 
 
-def test_after_a_stall_nothing_is_taken_where_none_tells_how_long_one_takes(process):
+def test_after_a_stall_the_clocks_are_compared_as_they_are_where_none_came_before(process):
     process.now += 2.0
     process.run(1.0)
-    assert process.take(2.5, OTHER)
-    assert process.take(0.01, OTHER)
-    process.run(SENT_AGAIN_S)
-    assert not process.take(0.01, OTHER)
+    assert process.stalls.is_old(OTHER, 2.5, process.now)
+    assert not process.stalls.is_old(OTHER, 0.01, process.now)
+    assert process.stalls.is_old(OTHER, 2.5, process.now)
 
 
 @pytest.mark.parametrize("last", [0.0, 10.0])

@@ -150,6 +150,7 @@ class Program:
 
     def run(self, stream: Any) -> int:
         """Be the node until the agent's end of the socket is closed, or ROS 2 is shut down; returns the exit code."""
+        self._stalls = Stalls(_now())  # to become the node took its time
         for job in (lambda: self._read(stream), self._watch, self._turn):
             threading.Thread(target=job, daemon=True).start()
         alive_at = 0.0

@@ -20,7 +20,7 @@ class Stalls:
     """Knows when this process stood still, and so which velocities are old.
 
     Whoever publishes may have another clock, and of several each its own: after a stall, a velocity is old if it took
-    longer than the quickest of the topic did, or if none came before.
+    longer than the quickest of the topic did; if none came before, its publisher's clock is taken to be ours.
 
     Args:
         now: Seconds, of a clock that goes on while the machine sleeps; as ``now`` of the methods.
@@ -55,11 +55,11 @@ class Stalls:
             return True
         if took is None:
             return False
-        quickest, at = self._quickest.get(topic, (-inf, now))
+        quickest, at = self._quickest.get(topic, (0.0, now))
         usual = quickest + DRIFT * (now - at)
         if now - self._went_on < SENT_AGAIN_S and took - usual > STOOD_S:
             return True
-        self._quickest[topic] = (took if usual == -inf else min(took, usual)), now
+        self._quickest[topic] = (min(took, usual) if topic in self._quickest else took), now
         return False
 
     def explains(self, topic: Hashable) -> bool:
