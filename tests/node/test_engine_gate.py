@@ -693,6 +693,13 @@ class Site:
             while not any(line.startswith(begins) for line in self.engine.lines):
                 await asyncio.sleep(0.01)
 
+    async def slowly(self, line: str) -> asyncio.Task[bytes]:
+        """Ask something that the engine does not answer before it is let."""
+        self.engine.slow[line] = threading.Event()
+        asks = asyncio.create_task(self.ask(line))
+        await self.soon(line)
+        return asks
+
     @property
     def removed(self) -> list[str]:
         return [line.removeprefix("DELETE /v1.41/") for line in self.engine.lines if line.startswith("DELETE /v1.41")]
@@ -822,9 +829,7 @@ def test_no_kin_starts_while_files_are_removed_and_all_others_do(engine: Engine)
         site = Site(engine)
         await site.start(X)
         removes = f"DELETE /v1.41/containers/{X}?v=1"
-        engine.slow[removes] = threading.Event()
-        asks = asyncio.create_task(site.ask(removes))
-        await site.soon(removes)
+        asks = await site.slowly(removes)
         asks.cancel()
         waits = asyncio.create_task(site.start(Y))
         await site.start(Z)
@@ -845,9 +850,7 @@ def test_a_start_waits_some_time_for_a_removal_and_is_told(engine: Engine, monke
         site = Site(engine)
         await site.start(X)
         removes = f"DELETE /v1.41/containers/{X}?v=1"
-        engine.slow[removes] = threading.Event()
-        asks = asyncio.create_task(site.ask(removes))
-        await site.soon(removes)
+        asks = await site.slowly(removes)
         said = await site.ask(f"POST /v1.41/containers/{Y}/start")
         assert b"503 Service Unavailable" in said
         assert b"a volume is being removed that it may get a folder of" in said
@@ -895,9 +898,7 @@ def test_whose_network_is_joined_is_paused_meanwhile_and_not_ended(engine: Engin
         done = [line for line in engine.lines if line in (pause, starts, unpause)]
         assert done[:3] == [pause, starts, unpause]
         assert [line for line in engine.lines if line.endswith("pause")] == [pause, unpause] * 2, "one after the other"
-        engine.slow[ends] = threading.Event()
-        ended = asyncio.create_task(site.ask(ends))
-        await site.soon(ends)
+        ended = await site.slowly(ends)
         engine.running -= {Y}
         assert b"whose network it joins is being ended" in await site.ask(starts)
         engine.slow[ends].set()

@@ -154,8 +154,8 @@ class Removals:
         An engine writes through a link to a device that what runs there makes meanwhile.
         """
         await self.look_back()
-        status = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
-        state = json.loads(status.content).get("State") or {} if status.status == HTTPStatus.OK else {}
+        found = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
+        state = json.loads(found.content).get("State") or {} if found.status == HTTPStatus.OK else {}
         if container in self._mine or state.get("Status") != "created":
             return None
         self._puts.add(container)

@@ -130,7 +130,6 @@ class Program:
         """Of those that are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._hearing: dict[int, Hearing] = {}
-        self._stalls = Stalls(_now())
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
