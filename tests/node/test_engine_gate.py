@@ -72,6 +72,8 @@ class Engine:
         """By what it is asked, what it waits for before it answers."""
         self.file = b""
         """What is in its containers."""
+        self.export = tar(("dev/null", tarfile.CHRTYPE, b""), devmajor=1, devminor=3)
+        """What is in its images."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
         engine = self
@@ -85,7 +87,7 @@ class Engine:
                     self.close_connection = True
                     return
                 engine.asked.append((f"{self.command} {self.path}", dict(self.headers), body))
-                for asked, waits in engine.slow.items():
+                for asked, waits in list(engine.slow.items()):
                     if f"{self.command} {self.path}".startswith(asked):
                         waits.wait(20)
                 other = next((one for one in engine.others if one in self.path), None)
@@ -116,6 +118,8 @@ class Engine:
                     )
                 if self.command == "GET" and "/archive" in self.path:
                     text = engine.file
+                if self.path.endswith("/export"):
+                    text = engine.export
                 self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {
@@ -580,7 +584,8 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     got = say(engine, sent + sent)
     if not says:
         assert got.count(b"200 OK") == 2
-        assert len([line for line in engine.lines if line.startswith("POST /containers/create")]) == 1  # once
+        made = [line for line in engine.lines if line.startswith("POST /containers/create")]
+        assert len(made) == 2  # for the ways, and to look through it; each once
         assert f"DELETE /containers/{ID}?force=1&v=1" in engine.lines
     else:
         assert says in got
@@ -599,9 +604,56 @@ def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Eng
 def test_no_orchestrator_starts_what_the_node_made_to_look_at_an_image(engine: Engine) -> None:
     """That image may say of itself whose it is, and have volumes that make the look a false one."""
     say(engine, request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json"))
-    (made,) = (json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create"))
-    engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
-    assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
+    all_made = [json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create")]
+    assert len(all_made) == 2
+    for made in all_made:
+        engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
+        assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
+
+
+REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Freports.json"
+DISK = tar(("disk", tarfile.BLKTYPE, b""), devmajor=8, devminor=0)
+
+
+def test_no_file_is_read_of_a_container_whose_image_has_a_disk(engine: Engine) -> None:
+    """The file becomes a link to it while the engine reads, and the engine may read any disk."""
+    engine.export = DISK
+    assert b"its files are not read: in its image, disk is a device" in say(engine, request(REPORT))
+    assert not any(line.startswith("GET") and "/archive" in line for line in engine.lines)
+
+
+def test_while_an_image_is_looked_through_whoever_asks_is_told_to_ask_again(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skytether.node.engine_gate._LOOK_THROUGH_S", 0.05)
+    line = REPORT.partition(" ")[2]
+
+    async def run() -> None:
+        site = Site(engine)
+        engine.slow[f"GET /containers/{ID}/export"] = threading.Event()
+        for _ in range(2):
+            said = await site.ask(f"GET {line}")
+            assert b"503" in said
+            assert b"is being looked through for files of devices: ask again" in said
+            assert b"Connection: close" not in said
+        engine.slow.popitem()[1].set()
+        async with asyncio.timeout(10):
+            while b"200 OK" not in await site.ask(f"GET {line}"):
+                await asyncio.sleep(0.01)
+        assert len([asked for asked in engine.lines if asked.endswith("/export")]) == 1
+
+    asyncio.run(run())
+
+
+def test_a_look_through_that_fails_is_tried_again(engine: Engine) -> None:
+    async def run() -> None:
+        site = Site(engine)
+        whole, engine.export = engine.export, engine.export[:600]
+        assert b"its image is not looked through: its engine sends half of an archive" in await site.ask(REPORT)
+        engine.export = whole
+        assert b"200 OK" in await site.ask(REPORT)
+
+    asyncio.run(run())
 
 
 def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> None:

@@ -18,14 +18,16 @@ import posixpath
 import re
 import secrets
 import tarfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
+from .devices import device_in
 from .engine_rules import DATA, FOLDER, LOOK, NOBODY, OWNER
-from .machine import ask
+from .machine import answered, ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
@@ -44,6 +46,8 @@ _MOST_USERS = 1 << 20
 """Bytes in one of these."""
 _KNOWN = 4096
 _BLOCK = 512
+_EXPORT_SILENCE_S = 60.0
+"""For each piece of an image's files."""
 _FOLDERS = {FOLDER: re.compile("instance"), DATA: re.compile("[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80}")}
 """Folders that are put in each."""
 _GRANT = "instance/grant.json"
@@ -132,7 +136,7 @@ class Images:
     def __init__(self, engine: str) -> None:
         """``engine``: path of its socket."""
         self._engine = engine
-        self._name = f"{LOOK}{secrets.token_hex(4)}"
+        self._names = [f"{LOOK}{secrets.token_hex(4)}" for _ in range(2)]
         self._known: dict[tuple[str, str], bool] = {}
 
     def odd(self, image: str, paths: Iterable[str]) -> str | None:
@@ -146,12 +150,35 @@ class Images:
         """
         wanted = sorted(paths)
         if new := [path for path in wanted if (image, path) not in self._known]:
-            found = self._inspect(image, new)
+            with self._made(image, self._names[0]) as container:
+                found = {(image, path): self._is_odd(container, path) for path in new}
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
             return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
         return next((path for path in wanted if self._known[image, path]), None)
 
-    def _inspect(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
+    def device(self, image: str) -> str | None:
+        """A file of a device in an image that is not for everybody, as `device_in` gives it; None: there is none.
+
+        Takes a second for some 70 MB. May be asked while `odd` is, and not twice at a time.
+
+        Raises:
+            OSError: The engine does not answer.
+            ValueError: It does not say, or there is too much in it.
+        """
+        with self._made(image, self._names[1]) as container:
+            export = f"/containers/{container}/export"
+            with answered(self._engine, export, patience=_EXPORT_SILENCE_S) as answer:
+                if answer.status != HTTPStatus.OK:
+                    raise ValueError(f"its engine says {answer.status} to {export}")
+                return device_in(answer)
+
+    @contextmanager
+    def _made(self, image: str, name: str) -> Iterator[str]:
+        """A container of an image, by its id.
+
+        Raises:
+            ValueError: It could not be made; or whoever removed it meanwhile had it seem empty.
+        """
         body = {
             "Image": image,
             "Entrypoint": ["/never-started"],
@@ -163,19 +190,18 @@ class Images:
                 "SecurityOpt": ["no-new-privileges"],
             },
         }
-        self._remove(self._name)  # should it have been left
-        made = ask(self._engine, f"/containers/create?name={self._name}", method="POST", body=body)
+        self._remove(name)  # should it have been left
+        made = ask(self._engine, f"/containers/create?name={name}", method="POST", body=body)
         if made.status != HTTPStatus.CREATED:
             raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
         container = json.loads(made.content)["Id"]
         try:
-            found = {(image, path): self._is_odd(container, path) for path in paths}
+            yield container
         except BaseException:
             self._remove(container)
             raise
         if not self._remove(container):
             raise ValueError("what was made of its image was removed meanwhile")  # and nothing was found there
-        return found
 
     def _remove(self, container: str) -> bool:
         return (

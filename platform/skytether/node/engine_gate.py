@@ -71,6 +71,8 @@ _MARKS = {
 """By kind, labels of which one makes a thing ours."""
 _KNOWN = 4096
 """Containers that are remembered to be ours."""
+_LOOK_THROUGH_S = 1.0
+"""That somebody who asks for a file waits for a look through its image, which goes on if it takes longer."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
 _MADE_S, _MOST_NETWORKS = 60.0, 12
@@ -107,14 +109,17 @@ class EngineGate:
         self._registries = Registries(registries)
         self._devices = devices
         self._ours: set[str] = set()
-        self._opened: set[str] = set()
-        """Containers into whose files the engine may look."""
+        self._opened: dict[str, str] = {}
+        """Containers into whose files the engine may look, and their images."""
+        self._looks: dict[str, asyncio.Task[str | None]] = {}
+        """By image that is looked through, or was."""
         self._images = Images(engine)
         self._removals = Removals(engine)
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
         self._large = asyncio.Semaphore(_MOST_LARGE)
         self._looking, self._weighing, self._making = asyncio.Lock(), asyncio.Lock(), asyncio.Lock()
+        self._looking_through = asyncio.Lock()
 
     async def pass_requests(self, asks: Stream, engine: Stream) -> None:
         """Until the one who asks has ended, or was refused something."""
@@ -202,7 +207,7 @@ class EngineGate:
         if SEEN.fullmatch(path) and call.method == "GET":
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
-            return self._file(target)
+            return self._file(name, target)
         if path.endswith("/archive") and call.method == "PUT":
             return self._put(name, target, archive)
         if kind == "containers" and path.endswith("/start"):
@@ -259,13 +264,13 @@ class EngineGate:
         if not await self._is_ours(("kept networks", mode)):
             raise RefusedCall(f"no guard has a right in {mode[:80]}, which no orchestrator made")
 
-    async def _may_be_opened(self, container: str) -> None:
-        """Raises unless the engine may look into its files."""
+    async def _may_be_opened(self, container: str) -> str:
+        """Its image, empty if it is gone; raises unless the engine may look into its files."""
         if container in self._opened:
-            return
+            return self._opened[container]
         status, found = await self._asked(f"/containers/{container}/json")
         if status == HTTPStatus.NOT_FOUND:
-            return
+            return ""
         if status != HTTPStatus.OK or (refused := moved(found)):
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
         try:
@@ -275,8 +280,9 @@ class EngineGate:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if odd:
             raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file, or a large one")
-        self._opened = self._opened if len(self._opened) < _KNOWN else set()
-        self._opened.add(container)
+        self._opened = self._opened if len(self._opened) < _KNOWN else {}
+        self._opened[container] = str(found["Image"])
+        return self._opened[container]
 
     async def _may_be_started(self, container: str) -> Any:
         """What the engine says of it; raises unless its networks are ours still: by their names it is connected.
@@ -321,12 +327,42 @@ class EngineGate:
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
-    async def _file(self, target: str) -> tuple[int, bytes, str]:
+    async def _file(self, container: str, target: str) -> tuple[int, bytes, str]:
         """An engine that waits until somebody takes the rest of a file lets nobody end its container."""
+        if image := await self._may_be_opened(container):
+            try:
+                if odd := await self._device(image):
+                    raise RefusedCall(f"its files are not read: in its image, {odd}")
+            except TimeoutError:
+                text = f"image {image} is being looked through for files of devices: ask again"
+                return HTTPStatus.SERVICE_UNAVAILABLE, json.dumps({"message": text}).encode(), _JSON
+            except (OSError, ValueError) as error:
+                why = f"its image is not looked through: {error}"
+                raise RefusedCall(why, HTTPStatus.SERVICE_UNAVAILABLE) from error
         answer = await self._ask(target, most=_MOST_FILE + 1)
         if len(answer.content) > _MOST_FILE:
             raise RefusedCall("the file is larger than those that a site asks for")
         return answer.status, answer.content, _TAR if answer.status == HTTPStatus.OK else _JSON
+
+    async def _device(self, image: str) -> str | None:
+        """As `Images.device`; raises `TimeoutError` while that is not known yet. It is found out once."""
+        if image not in self._looks:
+            if len(self._looks) >= _KNOWN:
+                self._looks = {one: task for one, task in self._looks.items() if not task.done()}
+            if len(self._looks) >= _KNOWN:
+                raise TimeoutError
+            self._looks[image] = asyncio.create_task(self._look_through(image))
+        task = self._looks[image]
+        await asyncio.wait((task,), timeout=_LOOK_THROUGH_S)
+        if not task.done():
+            raise TimeoutError
+        if task.cancelled() or task.exception():
+            self._looks.pop(image, None)  # whoever asks again has it tried again
+        return task.result()
+
+    async def _look_through(self, image: str) -> str | None:
+        async with self._looking_through:
+            return await asyncio.to_thread(self._images.device, image)
 
     async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
         """A network, unless there are many of ours."""
