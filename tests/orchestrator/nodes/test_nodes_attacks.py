@@ -270,12 +270,12 @@ def test_a_node_that_links_again_and_again_is_told_to_wait(nodes: NodeScene) -> 
     """With another address each time: its site would be opened anew with each."""
     nodes.join(advertise=None)
     trust, said = context_of(nodes.store()), []
-    for number in range(door.LINKS + 3):
+    while len(said) < 5 * door.LINKS and b"too many requests" not in b"".join(said[-1:]):
         with connection(nodes, trust) as link:
-            link.sendall(line_of(Link(address=f"192.0.2.{number}")))
+            link.sendall(line_of(Link(address=f"192.0.2.{len(said)}")))
             said.append(first_line(link))
-    assert b"too many requests" in said[-1]
-    assert b"too many requests" not in said[0]
+    assert b"too many requests" in said[-1]  # later on a slow machine: more are let in as time goes by
+    assert len(said) >= door.LINKS  # the join took one
     address = nodes.operator.get_site("edge").options["advertise_host"]
     assert int(address.rpartition(".")[2]) < 10  # the first few
 
