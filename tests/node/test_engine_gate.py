@@ -656,6 +656,20 @@ def test_a_look_through_that_fails_is_tried_again(engine: Engine) -> None:
     asyncio.run(run())
 
 
+def test_an_engine_that_falls_silent_in_a_look_through_is_told_as_that(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skytether.node.archives._EXPORT_SILENCE_S", 0.05)
+    engine.slow[f"GET /containers/{ID}/export"] = threading.Event()
+
+    async def run() -> bytes:
+        said = await Site(engine).ask(REPORT)
+        engine.slow.popitem()[1].set()
+        return said
+
+    assert b"its image is not looked through: timed out" in asyncio.run(run())
+
+
 def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> None:
     ours = {"Name": "skytether-a", "Labels": {"skytether.io/owner": "edge"}, "UsageData": {"Size": 7}}
     engine.volumes = [ours, {"Name": "database", "Options": {"o": "password=secret"}, "Labels": None}]

@@ -333,9 +333,8 @@ class EngineGate:
             try:
                 if odd := await self._device(image):
                     raise RefusedCall(f"its files are not read: in its image, {odd}")
-            except TimeoutError:
-                text = f"image {image} is being looked through for files of devices: ask again"
-                return HTTPStatus.SERVICE_UNAVAILABLE, json.dumps({"message": text}).encode(), _JSON
+            except BusyError as error:
+                return HTTPStatus.SERVICE_UNAVAILABLE, json.dumps({"message": str(error)}).encode(), _JSON
             except (OSError, ValueError) as error:
                 why = f"its image is not looked through: {error}"
                 raise RefusedCall(why, HTTPStatus.SERVICE_UNAVAILABLE) from error
@@ -345,17 +344,18 @@ class EngineGate:
         return answer.status, answer.content, _TAR if answer.status == HTTPStatus.OK else _JSON
 
     async def _device(self, image: str) -> str | None:
-        """As `Images.device`; raises `TimeoutError` while that is not known yet. It is found out once."""
+        """As `Images.device`; raises `BusyError` while that is not known yet. It is found out once."""
+        busy = BusyError(f"image {image} is being looked through for files of devices: ask again")
         if image not in self._looks:
             if len(self._looks) >= _KNOWN:
                 self._looks = {one: task for one, task in self._looks.items() if not task.done()}
             if len(self._looks) >= _KNOWN:
-                raise TimeoutError
+                raise busy
             self._looks[image] = asyncio.create_task(self._look_through(image))
         task = self._looks[image]
         await asyncio.wait((task,), timeout=_LOOK_THROUGH_S)
         if not task.done():
-            raise TimeoutError
+            raise busy
         if task.cancelled() or task.exception():
             self._looks.pop(image, None)  # whoever asks again has it tried again
         return task.result()
