@@ -2,9 +2,13 @@
 
 import mmap
 import os
+import signal
 import struct
-from contextlib import closing, suppress
+import subprocess
+import sys
+from contextlib import closing, contextmanager, suppress
 from math import isnan, nan
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +19,7 @@ from skytether.guard.protocol import Beat, LastCommand
 from skytether.guard.teller import Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
+from skytether.ros.ros2 import native
 
 BOUNDS = Bounds(0.5, -0.1, 0.8, 1.0, 2.0, 2.0, 4.0)
 PERIOD, PATIENCE = 0.02, 0.1
@@ -303,6 +308,62 @@ def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
     with pytest.raises(PermissionError):
         os.ftruncate(file, 0)
     os.close(file)
+
+
+SPEAKS = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from side.speaking import Speaking
+with Speaking(int(sys.argv[2]), int(sys.argv[3]))():
+    print("speaks", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextmanager
+def who_stands_still_as_it_speaks(page, role):
+    """A process between its last look at the clock and the kernel."""
+    file, start = page.place(role)
+    process = subprocess.Popen(
+        [sys.executable, "-c", SPEAKS, str(Path(native.__file__).parent), str(file), str(start)],
+        pass_fds=[file],
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"speaks\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("role", Role)
+def test_who_takes_over_ends_what_stands_still_as_it_speaks(both, role):
+    first, second = both
+    with who_stands_still_as_it_speaks(first.board, role) as process:
+        first.turn(1.0, FAST)
+        assert second.turn(1.1) is False  # it claims
+        assert first.teller.ended == second.teller.ended == ""
+        assert second.turn(1.12)
+        if role is Role.SECOND:
+            assert second.teller.ended == ""  # it is its own
+            first.turn(1.14, FAST)  # claims
+            assert first.turn(1.17, FAST)
+        taker = second if role is Role.FIRST else first
+        assert taker.teller.ended.startswith(f"process {process.pid} stood still")
+        assert process.wait(10) == -signal.SIGKILL
+        assert taker.turn(1.2)
+        assert taker.teller.ended == ""
+
+
+def test_who_goes_on_speaking_ends_nothing(both):
+    first, _ = both
+    with who_stands_still_as_it_speaks(first.board, Role.SECOND) as process:
+        for i in range(1, 10):
+            assert first.turn(1.0 + i * PERIOD, FAST)
+            assert first.teller.ended == ""
+        assert process.poll() is None
 
 
 def test_wheels_that_do_not_acknowledge_are_braked_and_go_on_from_there(both):

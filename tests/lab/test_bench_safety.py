@@ -58,7 +58,14 @@ def test_some_attacks_on_real_processes():
 def test_some_attacks_on_a_robot_on_real_ros_2(ros2, monkeypatch):
     """What waits in a node's program that hangs is told nobody later, and who takes over from it makes no jump."""
     monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
-    few = ("writer-killed", "writer-program-frozen-1", "program-frozen-stop", "button-gate-frozen", "stranger")
+    few = (
+        "writer-killed",
+        "writer-program-frozen-1",
+        "writer-program-frozen-in-the-midst",
+        "program-frozen-stop",
+        "button-gate-frozen",
+        "stranger",
+    )
     rows = list(bench_safety(select([f"ros2-{name}" for name in few], with_ros2=True), 1, safety=UNHURRIED))
     assert [what for row in rows for what in row.what] == []
     assert len(rows) == len(few)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import signal
 import struct
 from enum import IntEnum
 from math import isfinite, nan
@@ -24,6 +25,10 @@ _SUM = struct.Struct("<I")
 _SLOT = 64
 """Bytes between two entries: a line of the processor's cache each."""
 _SIZE = 4096
+_LOCK = struct.Struct("hhqqi0q")
+"""``struct flock`` of the kernel."""
+_PROCESSES = 1 << 32
+"""More than there are."""
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
 
 
@@ -49,6 +54,14 @@ class Entry(NamedTuple):
         return self.claim if not self.told.at >= self.claim and isfinite(self.claim) else self.told.at
 
 
+class Place(NamedTuple):
+    """Where each process of a role locks one byte, that of its own number, while it tells the wheels something."""
+
+    file: int
+    """Descriptor of the board."""
+    start: int
+
+
 class Board:
     """The page. Each role has two places and writes to them in turn: one that dies while it writes spoils only one.
 
@@ -58,6 +71,7 @@ class Board:
 
     def __init__(self, file: int) -> None:
         self._page = mmap.mmap(file, _SIZE)
+        self._file = file
 
     def put(self, role: Role, entry: Entry) -> None:
         """Write down. Only one process at a time may have a role."""
@@ -75,6 +89,26 @@ class Board:
         """What the wheels were told last, by whomever."""
         first, second = self.of(Role.FIRST).told, self.of(Role.SECOND).told
         return first if not second.at >= first.at else second
+
+    def place(self, role: Role) -> Place:
+        """Where those of a role lock."""
+        return Place(self._file, (1 + role) * _PROCESSES)
+
+    def end_speaker(self, role: Role) -> int:
+        """End a process that is telling the wheels something. Its number; 0: there is none, or it is not ours to end.
+
+        It looked at the clock before. If it was frozen since then, it would go on with that, whatever the wheels were
+        told meanwhile; one that the kernel ends goes on with nothing.
+        """
+        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, self.place(role).start, _PROCESSES, 0)
+        try:
+            kind, _, _, _, pid = _LOCK.unpack(fcntl.fcntl(self._file, fcntl.F_GETLK, asked))
+            if kind == fcntl.F_UNLCK or pid <= 0:
+                return 0
+            os.kill(pid, signal.SIGKILL)
+        except OSError:
+            return 0
+        return int(pid)
 
     def close(self) -> None:
         """Let go of the page."""

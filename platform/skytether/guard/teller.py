@@ -9,6 +9,8 @@ the other one has either seen that or cannot speak any more:
 - The first, once the second may speak (`LATE` periods after its claim), claims too and waits for a period, in which
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
+- Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
+  kernel is ended by who takes over (`board.Board.end_speaker`).
 
 Whoever turns the wheels may be held up, and read later what waits for it. Once no more can be sent to it, nobody knows
 whether they turn: it is told what goes on from the last velocity, or, when that was too long ago, nothing until it has
@@ -38,6 +40,7 @@ LATE = 0.75
 _SOON = 0.5
 """Periods. So much later than the second's claim the first may still speak without a claim of its own."""
 _UNREAD = "their driver does not read what it is sent"
+_ENDED = "process {} stood still as it told the wheels something, and was ended: it would go on with what is old by now"
 _LATER = 2
 """Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
 _AGAIN_S = 1.0
@@ -104,6 +107,8 @@ class Teller:
         self._strangers = False
         self.unread = ""
         """What is wrong with those who were told something last: they do not acknowledge it; empty: nothing."""
+        self.ended = ""
+        """Whether a process was ended at the last attempt, in words; empty: none was."""
         self._broken_at = nan
         self._full_at = nan
         self._own, self._claim = board.of(role)  # of who had the role before
@@ -130,6 +135,7 @@ class Teller:
             OSError: There is nobody whom anybody could tell anything. It counts as a standstill.
             Exception: This way to them is broken. It counts as silence.
         """
+        self.ended = ""
         unheard = self._listeners is not None and not self._listeners
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
@@ -142,6 +148,11 @@ class Teller:
         at = self._clock()
         if at - now > LATE * self._period_s or not self._may(at):
             return False
+        other = _OTHER[self._role]
+        spoke = self._board.of(other).told.at
+        if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
+            pid = self._board.end_speaker(other)
+            self.ended = _ENDED.format(pid) if pid else ""
         try:
             self._wheels.write(velocity)
         except BlockingIOError:

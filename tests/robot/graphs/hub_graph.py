@@ -183,7 +183,7 @@ class Hub(GraphKind[HubSection, HubWay]):
     def open_sensors(self, way, topics, trouble) -> HubSensors:
         return HubSensors(way, topics, trouble)
 
-    def open_wheels(self, way, role, timing, enable_topic) -> HubWheels:
+    def open_wheels(self, way, role, timing, enable_topic, place) -> HubWheels:
         return HubWheels(way, enable_topic)
 
     def open_display(self, way, topic) -> HubDisplay:

@@ -10,7 +10,7 @@ from typing import Any
 
 from . import deaths, storm
 from .attacks import Attacks
-from .graphs import ROLES, with_a_writer
+from .graphs import ROLES, frozen_in_the_midst, with_a_writer
 from .robot import PlayedRobot
 from .ros1_hardware import Ros1Hardware
 from .stage import Stage
@@ -23,6 +23,7 @@ def enter(attacks: Attacks) -> None:
         attacks.add(f"ros1-{name}", f"ROS 1: {what}", run, seconds=seconds, robot=_robot)
 
     with_a_writer(add)
+    add(*frozen_in_the_midst("writer", "the writer", lambda stage: [stage.robot.pid("writer")]), 6)
     for seed in storm.SEEDS:
         add(f"storm-{seed}", storm.WHAT.format(seed), storm.storm(seed, ROLES), 6)
     add("master-killed", "the master is killed, then the agent; the master starts again", _master, 6)

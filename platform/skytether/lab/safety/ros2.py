@@ -17,7 +17,7 @@ from skytether.guard.velocity import STANDSTILL
 
 from . import deaths, storm
 from .attacks import Attacks
-from .graphs import ROLES, with_a_writer
+from .graphs import ROLES, frozen_in_the_midst, with_a_writer
 from .robot import PlayedRobot, scan_of
 from .ros2_hardware import Ros2Hardware
 from .stage import Stage
@@ -44,6 +44,7 @@ def enter(attacks: Attacks) -> None:
         for seconds in _FREEZES_S:
             what = f"{words} is frozen for {seconds:g} s, and goes on"
             add(f"{role}-program-frozen-{seconds:g}", what, _frozen(role, seconds), seconds + 2)
+    add(*frozen_in_the_midst("writer-program", "the writer's program", lambda stage: _programs(stage, "writer")), 6)
     add("program-frozen-stop", "a stop while the writer's program is frozen", _frozen_and("stop"), 4)
     add("program-frozen-agent", "the agent is killed while the writer's program is frozen", _frozen_and("agent"), 4)
     add("program-frozen-writer", "the writer is killed while its program is frozen", _frozen_and("writer"), 6)

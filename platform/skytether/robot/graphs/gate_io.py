@@ -14,13 +14,15 @@ class WheelsTiming(NamedTuple):
 
     Attributes:
         guard_s: The guard brakes when the gate has said nothing for this long, and the gate when the guard has not.
-        fresh_s: How old a velocity may get that another process sends for whoever tells the wheels: by then the other
-            one is to speak.
+        fresh_s: How old a velocity may get that another thread or process sends for whoever tells the wheels. It is no
+            older when the other one speaks, if who tells them and who sends it stand still together.
+        stuck_s: After how long who sends it counts as standing still.
         brakes_s: Within this time the gate has stopped wheels that nobody else tells anything.
     """
 
     guard_s: float
     fresh_s: float
+    stuck_s: float
     brakes_s: float
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Generic, Literal, TypeVar
 from pydantic import Field, field_validator
 
 from skytether.api.manifest import Manifest, Strict
+from skytether.guard.board import Place
 from skytether.messages import Encoding, type_of
 from skytether.ros.names import Generation, Names, check_name, resolve
 
@@ -177,7 +178,7 @@ class GraphKind(ABC, Generic[Section, Way]):
         """
 
     @abstractmethod
-    def open_wheels(self, way: Way, role: Role, timing: WheelsTiming, enable_topic: str) -> Wheels:
+    def open_wheels(self, way: Way, role: Role, timing: WheelsTiming, enable_topic: str, place: Place | None) -> Wheels:
         """Where velocities go.
 
         Args:
@@ -185,6 +186,7 @@ class GraphKind(ABC, Generic[Section, Way]):
             role: Who writes: the guard's writer, or the gate when that is gone.
             timing: Until when a velocity or a level may be sent.
             enable_topic: Of the enable signal; empty: there is none.
+            place: Where whoever sends a velocity on says that it is about to; None: there is nobody who would look.
         """
 
     @abstractmethod

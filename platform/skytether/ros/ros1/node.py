@@ -25,7 +25,7 @@ from skytether.ros.names import bridge_type, resolve
 
 from . import services
 from .master import Master
-from .publication import QUEUE, Publication
+from .publication import QUEUE, Publication, Speaking
 from .registry import LOOK_S, Registry
 from .services import CallRefusedError, ServiceServer, ServiceType
 from .slave import SlaveServer
@@ -230,6 +230,7 @@ class Node:
         latched: bool = False,
         queue: int = QUEUE,
         hold_s: float = 0.0,
+        speaking: Speaking = contextlib.nullcontext,
     ) -> Publication:
         """Publish a topic.
 
@@ -241,13 +242,23 @@ class Node:
             latched: Newcomers get the last message.
             queue: Messages that wait for a slow subscriber; the newest win.
             hold_s: How long messages wait for a first subscriber while there is none; as many as in the queue.
+            speaking: Entered while the node's thread looks whether a message is still fresh, and sends it.
 
         Raises:
             ValueError: This node publishes it already.
         """
         definition = definition or definition_of(bridge_type(kind), "ros1")
         publication = Publication(
-            self.name, self.soon, topic, kind, md5, definition, latched=latched, queue=queue, hold_s=hold_s
+            self.name,
+            self.soon,
+            topic,
+            kind,
+            md5,
+            definition,
+            latched=latched,
+            queue=queue,
+            hold_s=hold_s,
+            speaking=speaking,
         )
         with self._lock:
             if topic in self._publications:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from math import inf
 
 from skytether.guard.clock import now as boottime
@@ -29,6 +30,7 @@ _HANDOVER = 1000
 _MAX_SUBSCRIBERS = 256
 
 
+Speaking = Callable[[], AbstractContextManager[None]]
 _Frame = tuple[bytes, float]
 """What goes to subscribers, and when it is too old for that [s, as `boottime`]."""
 
@@ -37,12 +39,18 @@ class _Subscriber:
     """One connection."""
 
     def __init__(
-        self, caller: str, writer: asyncio.StreamWriter, queue: int, clock: Callable[[], float] = boottime
+        self,
+        caller: str,
+        writer: asyncio.StreamWriter,
+        queue: int,
+        clock: Callable[[], float] = boottime,
+        speaking: Speaking = nullcontext,
     ) -> None:
         self.caller = caller
         self.writer = writer
         self.dropped = 0
         self._clock = clock
+        self._speaking = speaking
         self._limit = queue
         self._queue: deque[_Frame] = deque()
         self._bytes = 0
@@ -76,10 +84,11 @@ class _Subscriber:
 
     def _write(self, frame: bytes, until: float) -> None:
         """Right before it goes, for this process may have stood still since it was wanted."""
-        if self._clock() <= until:
-            self.writer.write(frame)
-        else:
-            self.dropped += 1
+        with self._speaking():
+            if self._clock() <= until:
+                self.writer.write(frame)
+            else:
+                self.dropped += 1
 
     def close(self) -> None:
         if self._draining is not None:
@@ -109,6 +118,7 @@ class Publication:
         latched: bool,
         queue: int,
         hold_s: float = 0.0,
+        speaking: Speaking = nullcontext,
         clock: Callable[[], float] = boottime,
     ) -> None:
         self.topic = topic
@@ -132,6 +142,7 @@ class Publication:
         self._held: deque[tuple[float, bytes]] = deque(maxlen=queue)
         self._newest: bytes | None = None
         self._lock = threading.Lock()
+        self._speaking = speaking
         self._clock = clock
         self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
@@ -182,7 +193,7 @@ class Publication:
             await writer.drain()
             return
         writer.write(self._header)
-        subscriber = _Subscriber(caller, writer, self._queue, self._clock)
+        subscriber = _Subscriber(caller, writer, self._queue, self._clock, self._speaking)
         if self._latched and self._newest is not None:
             subscriber.send(self._newest)
         while self._held:

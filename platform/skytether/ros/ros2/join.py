@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Protocol
 
+from skytether.guard.board import Place
+
 from .dialect import NodeName, RmwZenoh, Ros2Dds
 from .seam import GraphNode
 
@@ -51,13 +53,14 @@ def check_keys(how: Joining, zenoh_config: Path | None) -> None:
             raise ValueError(f"{key}: is for dialect: rclpy, and this one is {how.dialect}")
 
 
-def make_node(how: Joining, name: NodeName, zenoh_config: Path | None) -> GraphNode:
+def make_node(how: Joining, name: NodeName, zenoh_config: Path | None, place: Place | None = None) -> GraphNode:
     """The node, not yet started.
 
     Args:
         how: What the configuration says.
         name: Who we are.
         zenoh_config: Zenoh's own configuration.
+        place: Where it is said that a velocity is about to be published, if another program does that.
 
     Raises:
         Ros2Error: It cannot be what it was told to be.
@@ -67,7 +70,7 @@ def make_node(how: Joining, name: NodeName, zenoh_config: Path | None) -> GraphN
         from .native.node import RclpyNode
 
         arguments = [*how.ros_args, *(["-p", "use_sim_time:=true"] if how.use_sim_time else [])]
-        return RclpyNode(name, python=how.python, domain=how.domain, arguments=arguments)
+        return RclpyNode(name, python=how.python, domain=how.domain, arguments=arguments, place=place)
     from .node import Ros2Node  # Zenoh is an extra
 
     dialect = (

@@ -91,9 +91,10 @@ class Ros2Node(NodeBase):
         farewell: bytes = b"",
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
+        stuck_s: float | None = None,
     ) -> Publication:
         """Be a publisher; a farewell is not said, because a router has no way to do it for us, and none waits here."""
-        del farewell, farewell_after_s, fresh_s
+        del farewell, farewell_after_s, fresh_s, stuck_s
         publication = Publication(self, endpoint)
         publication.waits = waits
         return self._add(publication)

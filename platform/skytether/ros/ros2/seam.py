@@ -98,6 +98,7 @@ class GraphNode(Protocol):
         farewell: bytes = b"",
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
+        stuck_s: float | None = None,
     ) -> Publication:
         """Be a publisher.
 
@@ -106,8 +107,10 @@ class GraphNode(Protocol):
             waits: No message is dropped because there is no room for it now, unless very many wait.
             farewell: Published when this process ends, however it ends, where the way to the graph can do that.
             farewell_after_s: So much later: who else speaks there comes first [s].
-            fresh_s: Where another process has the way to the graph: what waits there for longer than this, or behind
-                something that does, is never published [s].
+            fresh_s: Where another process has the way to the graph: what waits there for longer than this is never
+                published [s].
+            stuck_s: The same of what waits behind something that waits for longer than this, and none is taken until
+                then [s]; None: as ``fresh_s``.
         """
         ...
 

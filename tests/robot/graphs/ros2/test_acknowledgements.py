@@ -11,7 +11,7 @@ from skytether.robot.graphs.ros2.kind import Ros2
 from skytether.robot.graphs.ros2.sections import Ros2Way
 
 pytestmark = [pytest.mark.slow, pytest.mark.ros2]
-TIMING = WheelsTiming(guard_s=0.3, fresh_s=0.3, brakes_s=1.0)
+TIMING = WheelsTiming(guard_s=0.3, fresh_s=0.3, stuck_s=0.3, brakes_s=1.0)
 PERIOD_S = 0.02
 PATIENCE_S = 30.0
 
@@ -23,7 +23,7 @@ def test_a_node_that_hangs_does_not_acknowledge_which_may_be_ignored(tmp_path, r
     section = listener.section["ros2"]
     strict, lenient = (
         Ros2().open_wheels(
-            Ros2Way.model_validate({**section, "node": name, "need_acknowledgements": need}), "guard", TIMING, ""
+            Ros2Way.model_validate({**section, "node": name, "need_acknowledgements": need}), "guard", TIMING, "", None
         )
         for name, need in (("strict", True), ("lenient", False))
     )

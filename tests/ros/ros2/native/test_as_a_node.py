@@ -252,7 +252,9 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
             at = time.monotonic()
             until(lambda at=at: drive() and time.monotonic() - at > 1.0)
             base = listen("base")
-            assert base.heard[0] == 0.0, end
+            # What goes to one who was killed reaches whoever has its port by then, before DDS knows of him.
+            assert base.heard[0] == 0.0 or end == signal.SIGKILL
+            until(lambda base=base: (drive() and base.heard.extend(base.all())) or 0.0 in base.heard, "a standstill")
         assert wheels.renewed == 2
         assert 0.5 in recorder.heard
         wheels.close()

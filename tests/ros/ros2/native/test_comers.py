@@ -22,6 +22,14 @@ def test_who_may_be_back(ways, back):
     assert [number for number, names in enumerate(ways) if comers.is_anybody_back(names)] == back
 
 
+def test_who_comes_without_a_name_where_all_who_were_there_are_is_nobody_of_them():
+    comers = Comers()
+    assert not comers.is_anybody_back(["/base"])
+    assert not comers.is_anybody_back(["/base", ""], all_live=True)
+    assert not comers.is_anybody_back([""])
+    assert comers.is_anybody_back(["", ""], all_live=True), "but one who left"
+
+
 def test_of_those_who_left_some_are_known():
     comers = Comers()
     for number in range(2 * MOST):

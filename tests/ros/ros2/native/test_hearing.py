@@ -15,10 +15,12 @@ class Publisher:
         self.now = 100.0
 
     def publish(self, listeners, read, ticks=1):
-        """``listeners``: letters, each the name of a node."""
+        """``listeners``: letters, each the name of a node; a space has none yet, a capital acknowledges nothing."""
         for _ in range(ticks):
             self.now += TICK
-            self.hearing.update(len(listeners), read, self.now, lambda: listeners)
+            self.hearing.update(
+                len(listeners), read, self.now, lambda: [(name.strip(), not name.isupper()) for name in listeners]
+            )
             self.hearing.tell(len(listeners), self.now)
         return self.hearing
 
@@ -56,6 +58,20 @@ def test_who_comes_to_watch_stops_nobody(publisher):
     publisher.publish("b", True, 5)
     assert publisher.publish("be", True).heard
     assert publisher.publish("b", True).heard, "and who goes"
+
+
+def test_who_comes_without_a_name_yet_stops_nobody_where_all_who_were_there_acknowledge(publisher):
+    publisher.publish("b", True, 5)
+    assert publisher.publish("b ", False).heard, "of who comes nothing is acknowledged yet"
+    assert publisher.publish("be", True).heard
+
+
+@pytest.mark.parametrize(("there", "read"), [("b", False), ("B", True), ("rB", True)])
+def test_who_comes_without_a_name_yet_may_be_one_who_was_killed_and_is_shown_still(publisher, there, read):
+    publisher.publish(there, True, 5)
+    publisher.publish(there, read, 2)
+    assert publisher.hearing.heard
+    assert not publisher.publish(f"{there} ", read).heard
 
 
 def test_who_comes_while_nobody_is_heard_is_to_hear_a_first_word(publisher):

@@ -7,15 +7,18 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 
 from skytether.control.admittance import Velocity
+from skytether.guard.board import Place
 from skytether.guard.clock import now as boottime
 from skytether.messages import Bool, MarkerArray, Message, Twist, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
 from skytether.ros.ros1.subscription import Listener
+from skytether.ros.ros2.native.side.speaking import Speaking
 
 from ..inbox import Inbox, Topics
 from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
@@ -31,16 +34,22 @@ class Ros1Wheels(RosWheels[Node]):
         fresh_s: Nobody gets a velocity or a level that is older [s]: it is the node's own thread that sends them, and
             this process may stand still meanwhile.
         enable_topic: Of the enable signal, std_msgs/Bool; empty: there is none.
+        place: Where that thread says that it is about to send one.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros1Way, role: str, fresh_s: float, enable_topic: str = "") -> None:
+    def __init__(
+        self, way: Ros1Way, role: str, fresh_s: float, enable_topic: str = "", place: Place | None = None
+    ) -> None:
         self._fresh_s = fresh_s
         super().__init__(_start(way, role))
         topic = resolve(way.cmd_vel, way.namespace)
-        self._publication = self._node.advertise(topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1)
+        speaking = Speaking(*place) if place else nullcontext
+        self._publication = self._node.advertise(
+            topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1, speaking=speaking
+        )
         if role == "gate":
             own = [resolve(f"{way.node}_{each}", way.namespace) for each in ("guard", "gate")]
             self._watch = WheelsWatch(topic, own, partial(self._node.master.publishers, topic))

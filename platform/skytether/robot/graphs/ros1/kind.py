@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from skytether.api.manifest import Manifest
+from skytether.guard.board import Place
 from skytether.messages import Encoding
 from skytether.ros.names import Generation, resolve
 
@@ -77,10 +78,12 @@ class Ros1(GraphKind[Ros1Config, Ros1Way]):
 
         return Ros1Sensors(way, topics, trouble)
 
-    def open_wheels(self, way: Ros1Way, role: Role, timing: WheelsTiming, enable_topic: str) -> Wheels:
+    def open_wheels(
+        self, way: Ros1Way, role: Role, timing: WheelsTiming, enable_topic: str, place: Place | None
+    ) -> Wheels:
         from .gate_io import Ros1Wheels
 
-        return Ros1Wheels(way, role, timing.guard_s, enable_topic)
+        return Ros1Wheels(way, role, timing.fresh_s, enable_topic, place)
 
     def open_display(self, way: Ros1Way, topic: str) -> Display:
         from .gate_io import Ros1Display

@@ -12,6 +12,7 @@ from functools import partial
 from math import inf
 
 from skytether.control.admittance import Velocity
+from skytether.guard.board import Place
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
@@ -39,30 +40,32 @@ class Ros2Wheels(RosWheels[GraphNode]):
         timing: Nobody gets a velocity or a level that is older than `WheelsTiming.fresh_s`: the program that has the
             node sends them, and it, or this process, may stand still meanwhile. While it does, nobody listens.
         enable_topic: Of the enable signal, std_msgs/msg/Bool; empty: there is none.
+        place: Where the program says that it is about to send one.
 
     Raises:
         OSError: The node cannot be.
     """
 
-    def __init__(self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "") -> None:
+    def __init__(
+        self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "", place: Place | None = None
+    ) -> None:
         self._way = way
-        super().__init__(_start(way, role))
+        super().__init__(_start(way, role, place))
         self._clock = GraphClock(self._node)
         self._topic = resolve(way.cmd_vel, way.namespace)
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
-        self._publication = self._node.publish(
-            endpoint, farewell=farewell, farewell_after_s=timing.brakes_s, fresh_s=timing.fresh_s
-        )
+        publish = partial(self._node.publish, fresh_s=timing.fresh_s, stuck_s=timing.stuck_s)
+        self._publication = publish(endpoint, farewell=farewell, farewell_after_s=timing.brakes_s)
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
             self._watch = WheelsWatch(self._topic, own, self._publishers)
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
-            self._enable = self._node.publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE), fresh_s=timing.fresh_s)
+            self._enable = publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE))
 
     def write(self, velocity: Velocity) -> None:
         """Wheels: publish it."""
@@ -139,10 +142,10 @@ class Ros2Display(RosGateNode[GraphNode]):
         self._publication.put(encode(message))
 
 
-def _start(way: Ros2Way, role: str) -> GraphNode:
+def _start(way: Ros2Way, role: str, place: Place | None = None) -> GraphNode:
     name = NodeName(way.namespace, f"{way.node}_{role}")
     try:
-        node = make_node(way, name, way.zenoh_config)
+        node = make_node(way, name, way.zenoh_config, place)
     except Ros2Error as error:
         raise OSError(str(error)) from error
     node.start()

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from skytether.api.manifest import Manifest
+from skytether.guard.board import Place
 from skytether.ros.names import resolve
 from skytether.ros.ros2.config import need_extra
 
@@ -72,10 +73,12 @@ class Ros2(GraphKind[Ros2Config, Ros2Way]):
 
         return Ros2Sensors(way, topics, trouble)
 
-    def open_wheels(self, way: Ros2Way, role: Role, timing: WheelsTiming, enable_topic: str) -> Wheels:
+    def open_wheels(
+        self, way: Ros2Way, role: Role, timing: WheelsTiming, enable_topic: str, place: Place | None
+    ) -> Wheels:
         from .gate_io import Ros2Wheels
 
-        return Ros2Wheels(way, role, timing, enable_topic)
+        return Ros2Wheels(way, role, timing, enable_topic, place)
 
     def open_display(self, way: Ros2Way, topic: str) -> Display:
         from .gate_io import Ros2Display

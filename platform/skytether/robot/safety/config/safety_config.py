@@ -244,14 +244,16 @@ class SafetyConfig(SourcesConfig):
     def wheels_timing(self) -> WheelsTiming:
         """How long the wheels may be told nothing by one, until another does.
 
-        Whoever goes on for another claims the wheels 1.5 periods after a velocity that has become too old, and speaks
-        0.75 after that, or a turn more, which is within `guard_s`.
+        Whoever goes on for another claims the wheels 1.5 periods after its last velocity, and speaks 0.75 after that. A
+        velocity is sent on 0.75 after it was decided, at the latest, and then may get 1.5 periods old. Where only who
+        sends it stands still, who tells them begins to be silent when that counts as such: with a turn more, the other
+        one speaks within `guard_s`.
         """
         period, bounds = 1 / self.rate_hz, self.bounds()
         fastest = max(bounds.linear_max, -bounds.linear_min)
         braking = max(fastest / bounds.linear_braking, bounds.angular_max / bounds.angular_braking)
-        fresh_s = max(1.5 * period, self.guard_s - 3.25 * period)
-        return WheelsTiming(self.guard_s, fresh_s, self.guard_s + 3 * period + braking)
+        stuck_s = max(1.5 * period, self.guard_s - 3.25 * period)
+        return WheelsTiming(self.guard_s, 1.5 * period, stuck_s, self.guard_s + 3 * period + braking)
 
     def wheels_at(self) -> str:
         """Where the wheels are, in words that tell one robot's from another's."""

@@ -21,7 +21,7 @@ from math import isfinite
 from typing import Any
 
 from skytether.guard import privileges
-from skytether.guard.board import Board
+from skytether.guard.board import Board, Role
 from skytether.guard.child import LEAVE
 from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
@@ -273,8 +273,9 @@ def main() -> None:
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None
     sensors = open_sensors(config, lambda kind, sentence: notices.warn(kind, sentence, boottime()), estop)
-    wheels = open_wheels(config, "gate")
-    loop = GateLoop(config, guard, sensors, wheels, Board(int(sys.argv[3])), refused)
+    board = Board(int(sys.argv[3]))
+    wheels = open_wheels(config, "gate", board.place(Role.SECOND))
+    loop = GateLoop(config, guard, sensors, wheels, board, refused)
     gc.collect()
     gc.freeze()  # what is there now stays: later collections are short
     try:

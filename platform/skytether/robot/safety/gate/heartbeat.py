@@ -118,10 +118,13 @@ class Heartbeat:
     def _speak(self, now: float) -> bool:
         """Tell the wheels to stop, if it is the gate's turn."""
         try:
-            return self._teller.write_velocity(now)
+            told = self._teller.write_velocity(now)
         except Exception as error:  # tried again at the next turn
             self._trouble("wheels", f"the wheels cannot be told to stand: {error}", now)
-            return True
+            told = True
+        if self._teller.ended:
+            self._trouble("ended", self._teller.ended, now)
+        return told
 
     def note(self, sentence: str) -> None:
         """Something for the guard's event record."""

@@ -137,10 +137,13 @@ class Writer:
         """Tell the wheels. False: not yet."""
         self._teller.refresh()
         try:
-            return self._teller.write_velocity(now)
+            told = self._teller.write_velocity(now)
         except Exception as error:  # tried again in a moment
             self._log_throttle.warn("wheels", f"the wheels cannot be told anything: {error}", now)
-            return True
+            told = True
+        if self._teller.ended:
+            self._log_throttle.warn("ended", self._teller.ended, now)
+        return told
 
 
 def main() -> None:
@@ -156,8 +159,9 @@ def main() -> None:
     warm([Twist], config.encoding)
     for sentence in privileges.acquire(privileges.WRITER):
         _log.info("%s", sentence)
-    wheels = open_wheels(config, "guard")
-    writer = Writer(config, guard, wheels, Board(int(sys.argv[3])))
+    board = Board(int(sys.argv[3]))
+    wheels = open_wheels(config, "guard", board.place(Role.FIRST))
+    writer = Writer(config, guard, wheels, board)
     gc.collect()
     gc.freeze()
     try:

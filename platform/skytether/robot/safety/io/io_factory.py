@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable
 
+from skytether.guard.board import Place
+
 from ...graphs.gate_io import Display, Sensors, Wheels
 from ...graphs.kind import Role
 from ..config.address import address
@@ -34,12 +36,13 @@ def open_sensors(
     return SocketSensors(readings, estop or estop_address(config), config.topics(), trouble)
 
 
-def open_wheels(config: SafetyConfig, role: Role) -> Wheels:
+def open_wheels(config: SafetyConfig, role: Role, place: Place | None = None) -> Wheels:
     """Where velocities go.
 
     Args:
         config: The section of robot.yaml.
         role: Who writes.
+        place: See `skytether.robot.graphs.kind.GraphKind.open_wheels`.
 
     Raises:
         OSError: It cannot be had.
@@ -47,7 +50,7 @@ def open_wheels(config: SafetyConfig, role: Role) -> Wheels:
     if config.graph is not None:
         kind, way = config.graph
         enable = config.enable.topic if config.enable is not None and role == "guard" else None
-        return kind.open_wheels(way, role, config.wheels_timing(), enable or "")
+        return kind.open_wheels(way, role, config.wheels_timing(), enable or "", place)
     sockets = config.sockets or SocketsConfig()
     return SocketWheels(_address(config, sockets.wheels, WHEELS_SOCKET))
 

@@ -108,12 +108,14 @@ class Publication(Handle):
         farewell: bytes = b"",
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
+        stuck_s: float | None = None,
     ) -> None:
         super().__init__(host, channel, endpoint)
         self._waits = waits
         self._farewell = farewell
         self._farewell_after_s = farewell_after_s
         self._fresh_s = fresh_s
+        self._stuck_s = fresh_s if stuck_s is None else stuck_s
         self._lock = threading.Lock()
         self._numbers = itertools.count(1)
         self._waiting: deque[tuple[int, float]] = deque()
@@ -152,7 +154,7 @@ class Publication(Handle):
     def stuck(self) -> bool:
         """Whether the program has not dealt with one for longer than it may wait; then none is taken."""
         with self._lock:
-            return bool(self._waiting) and not 0 <= _now() - self._waiting[0][1] <= self._fresh_s
+            return bool(self._waiting) and not 0 <= _now() - self._waiting[0][1] <= self._stuck_s
 
     @property
     def unread_s(self) -> float:
@@ -173,7 +175,8 @@ class Publication(Handle):
         with self._lock:
             number, now = next(self._numbers), _now()
             self._waiting.append((number, now))
-            return fresh(self.channel, number, self._waiting[0][1] + self._fresh_s, self._heard, body)
+            until = min(now + self._fresh_s, self._waiting[0][1] + self._stuck_s)
+            return fresh(self.channel, number, until, self._heard, body)
 
     def on_frame(self, frame: Frame) -> None:
         number, unread_s, published, heard = pull_dealt_with(frame.body)

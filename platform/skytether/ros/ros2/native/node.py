@@ -20,6 +20,8 @@ from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
 
+from skytether.guard.board import Place
+
 from ..dialect import Endpoint, Kind, NodeName
 from ..graph import mismatches
 from ..node_base import NodeBase
@@ -58,6 +60,7 @@ class RclpyNode(NodeBase):
         environment: Of the program; None: this process's.
         arguments: For rclpy, as they follow ``--ros-args``: remappings, enclave, log level.
         say: Told each trouble once, and its end; by default it is logged.
+        place: Where the program says that it is about to publish something with ``fresh_s``.
 
     Raises:
         Ros2Error: There is no Python with rclpy.
@@ -72,8 +75,10 @@ class RclpyNode(NodeBase):
         environment: Mapping[str, str] | None = None,
         arguments: Sequence[str] = (),
         say: Callable[[str], object] | None = None,
+        place: Place | None = None,
     ) -> None:
         super().__init__(name, say)
+        self._place = place
         given = os.environ if environment is None else environment
         self.python = find_python(python, given)
         """That has rclpy."""
@@ -121,6 +126,7 @@ class RclpyNode(NodeBase):
         farewell: bytes = b"",
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
+        stuck_s: float | None = None,
     ) -> Publication:
         """Be a publisher; see `skytether.ros.ros2.seam.GraphNode`."""
         return self._add(
@@ -132,6 +138,7 @@ class RclpyNode(NodeBase):
                 farewell=farewell,
                 farewell_after_s=farewell_after_s,
                 fresh_s=fresh_s,
+                stuck_s=stuck_s,
             )
         )
 
@@ -210,7 +217,7 @@ class RclpyNode(NodeBase):
             with its:
                 program = subprocess.Popen(
                     [self.python, str(_SIDE), str(its.fileno())],
-                    pass_fds=[its.fileno()],
+                    pass_fds=[its.fileno(), *([self._place.file] if self._place else [])],
                     stdin=subprocess.DEVNULL,
                     env=self._environment,
                 )
@@ -257,7 +264,10 @@ class RclpyNode(NodeBase):
     def _keep(self, link: socket.socket) -> None:
         """Tell a new program what to be, and take what it tells until it ends."""
         sender = Sender(link)
-        sender.put(control(node=self._name.name, namespace=self._name.namespace, arguments=self._arguments))
+        name = self._name
+        sender.put(
+            control(node=name.name, namespace=name.namespace, arguments=self._arguments, speaks=self._place or ())
+        )
         with self._lock:
             if self._closing.is_set():
                 return

@@ -17,7 +17,7 @@ class Comers:
         self._away: dict[str, None] = {}
         """Who left and has not come back, the one who left first at first."""
 
-    def is_anybody_back(self, names: Collection[str]) -> bool:
+    def is_anybody_back(self, names: Collection[str], *, all_live: bool = False) -> bool:
         """Whether somebody came who may have been there before.
 
         Whoever comes may be one who left by another name. A name that is there twice is of one who was killed, too, and
@@ -25,12 +25,13 @@ class Comers:
 
         Args:
             names: Of all who listen now, one for each subscription; empty where it is not known.
+            all_live: Everybody who was there is: who comes without a name yet is nobody who was killed.
         """
         here = Counter(names)
         came, gone = here - self._here, self._here - here
         known = [name for name in gone if name]
         self._away |= dict.fromkeys(known)
-        back = bool(came) and (bool(self._away) or any(not name or name in self._here for name in came))
+        back = bool(came) and (bool(self._away) or any(name in self._here or not (name or all_live) for name in came))
         for name in came:
             self._away.pop(name, None)
         while len(self._away) > MOST:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Collection
 
 from .comers import Comers
 
+Listener = tuple[str, bool]
+"""Name of the node, empty where it is not known, and whether it acknowledges what it hears."""
 SILENT_S = 0.5
 """Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 HEARS_S = 3.0
@@ -28,9 +30,10 @@ class Hearing:
         self._told_since: float | None = None
         """Since when somebody listens to what was published [s]."""
         self._listeners = 0
+        self._read = False
         self._comers = Comers()
 
-    def update(self, listeners: int, read: bool, now: float, names: Callable[[], Collection[str]]) -> None:
+    def update(self, listeners: int, read: bool, now: float, nodes: Callable[[], Collection[Listener]]) -> None:
         """A message is about to be published.
 
         Who always takes longer to acknowledge one than it takes until the next is not known by it, and never counts.
@@ -39,10 +42,11 @@ class Hearing:
             listeners: How many there are.
             read: Whether they have acknowledged all that was published.
             now: Seconds.
-            names: Gives those of their nodes; asked where they are others.
+            nodes: Gives those of them; asked where they are others.
         """
         before, self._listeners = self._listeners, listeners
-        back = listeners != before and self._comers.is_anybody_back(names())
+        all_read, self._read = self._read, read  # before: of who comes now it is not known
+        back = listeners != before and self._is_anybody_back(nodes(), all_read=all_read)
         if not listeners:
             self.heard, self._told_since = False, None
         elif listeners > before and (back or self.unread_s > SILENT_S):
@@ -53,6 +57,10 @@ class Hearing:
         if read:
             self._read_at = now if listeners else None
         self.unread_s = 0.0 if self._read_at is None else now - self._read_at
+
+    def _is_anybody_back(self, nodes: Collection[Listener], *, all_read: bool) -> bool:
+        all_live = all_read and all(acknowledges for name, acknowledges in nodes if name)
+        return self._comers.is_anybody_back([name for name, _ in nodes], all_live=all_live)
 
     def tell(self, listeners: int, now: float) -> None:
         """A message was published, with so many who listen."""

@@ -46,6 +46,7 @@ from .frames import (
 )
 from .hearing import Hearing
 from .outbox import FIRST, Sender
+from .speaking import Speaking
 from .stalls import STOOD_S, TURN_S, Stalls
 
 LOOK_S = 0.2
@@ -106,7 +107,8 @@ class Program:
 
     Args:
         link: To the agent.
-        start: Name, namespace, arguments and parameters, as the agent tells them.
+        start: Name, namespace, arguments, and where to say that it is about to publish a velocity, as the agent tells
+            them.
     """
 
     def __init__(self, link: socket.socket, start: dict[str, Any]) -> None:
@@ -130,6 +132,9 @@ class Program:
         """Of those that are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
         self._hearing: dict[int, Hearing] = {}
+        place = start["speaks"]
+        self._speaking: Callable[[], contextlib.AbstractContextManager[None]]
+        self._speaking = Speaking(*place) if place else contextlib.nullcontext
         self._subscriptions: dict[int, Any] = {}
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
@@ -222,10 +227,13 @@ class Program:
             publisher, hearing = self._publishers.get(frame.channel), self._hearing.get(frame.channel, Hearing())
             if publisher is not None:
                 read = _has_been_read(publisher)
-                names = partial(graph.listeners, self._node, publisher.topic_name)
-                hearing.update(publisher.get_subscription_count(), read, _now(), names)
-                if _now() <= until and (hearing.heard or not heeds):  # or he is new, and it is no first word for him
-                    publisher.publish(body)
+                nodes = partial(graph.listeners, self._node, publisher.topic_name)
+                hearing.update(publisher.get_subscription_count(), read, _now(), nodes)
+                with self._speaking():
+                    new = _now() <= until and (hearing.heard or not heeds)  # or he is, and it is no first word for him
+                    if new:
+                        publisher.publish(body)
+                if new:
                     self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
                     hearing.tell(publisher.get_subscription_count(), _now())
             published = self._published.get(frame.channel, 0)
