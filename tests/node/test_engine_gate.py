@@ -13,6 +13,7 @@ import socketserver
 import tarfile
 import tempfile
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -25,8 +26,9 @@ import pytest
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
-from skytether.node.machine import is_taken
+from skytether.node.machine import is_taken, picked
 from skytether.node.registries import registry_of
+from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 ID, OTHER = "f" * 64, "e" * 64
 CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
@@ -37,6 +39,7 @@ WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
     b'"VolumeOptions": {"NoCopy": true}}], "CapDrop"',
 )
 
+OWN_VOLUME = {"Name": "a" * 64, "Destination": "/run/skytether"}
 VOLUME = b'{"Name": "skytether-main_state", "Labels": {"skytether.io/owner": "edge"}}'
 
 
@@ -48,7 +51,7 @@ class Engine:
         self.asked: list[tuple[str, dict[str, str], bytes]] = []
         self.ended = False
         """It takes connections, and answers nobody."""
-        self.container: dict[str, Any] = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": []}
+        self.container: dict[str, Any] = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": [OWN_VOLUME]}
         self.links: set[str] = set()
         """In its images."""
         self.large: set[str] = set()
@@ -62,6 +65,8 @@ class Engine:
         """Labels by name."""
         self.running: set[str] = set()
         """Containers, by their ids."""
+        self.paused: set[str] = set()
+        """Of those."""
         self.idle: set[str] = set()
         """Others that it has."""
         self.others: dict[str, dict[str, Any]] = {}
@@ -74,6 +79,8 @@ class Engine:
         """What is in its containers."""
         self.export = tar(("dev/null", tarfile.CHRTYPE, b""), devmajor=1, devminor=3)
         """What is in its images."""
+        self.odd_files = False
+        """It does not give these."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
         engine = self
@@ -108,7 +115,16 @@ class Engine:
                     text = json.dumps([{"Name": name} for name in engine.networks]).encode()
                 if self.path.startswith("/containers/json"):
                     there = set() if engine.unlisted else engine.running | engine.idle
-                    text = json.dumps([{"Id": one} for one in there]).encode()
+                    text = json.dumps(
+                        [
+                            {
+                                "Id": one,
+                                "State": "paused" if one in engine.paused else "running",
+                                "HostConfig": engine.others.get(one, {}).get("HostConfig"),
+                            }
+                            for one in there
+                        ]
+                    ).encode()
                 if self.path == "/volumes":
                     text = json.dumps({"Volumes": engine.volumes}).encode()
                 if engine.networks and self.command == "GET" and (name := self.path.partition("/networks/")[2]):
@@ -120,11 +136,15 @@ class Engine:
                     text = engine.file
                 if self.path.endswith("/export"):
                     text = engine.export
+                missing = missing or (engine.odd_files and self.command == "GET" and "/archive" in self.path)
                 self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {
                     "mode": 1 << 27 if asked in engine.links else 1 << 25 if asked in engine.pipes else 0o644,
                     "size": 1 << 30 if asked in engine.large else 1000,
+                    "name": asked.rpartition("/")[2],
+                    "mtime": "2026-11-27T12:00:00Z",
+                    "linkTarget": "/secret" if asked in engine.links else "",
                 }
                 self.send_header("X-Docker-Container-Path-Stat", base64.b64encode(json.dumps(stat).encode()).decode())
                 self.send_header("Content-Length", str(len(text)))
@@ -181,7 +201,7 @@ def say(engine: Engine, sent: bytes, registries: tuple[str, ...] = ()) -> bytes:
             writer.write(sent)
             got = b""
             async with asyncio.timeout(20):
-                while b"Connection: close" not in got and got.count(b"HTTP/1.1 20") < sent.count(b" HTTP/1.1\r\n"):
+                while b"Connection: close" not in got and got.count(b"HTTP/1.1 ") < sent.count(b" HTTP/1.1\r\n"):
                     piece = await reader.read(65536)
                     if not piece:
                         break
@@ -403,7 +423,8 @@ def test_a_guard_has_its_right_in_networks_of_orchestrators_alone(
     """By that it takes any address there, and what is sent to it."""
     engine.networks, engine.container = networks, {"HostConfig": {"NetworkMode": mode}}
     guard = CREATED.replace(b'"CapDrop"', b'"CapAdd": ["NET_ADMIN"], "CapDrop"') % f"container:{ID}".encode()
-    guard = guard.replace(b'privileges"]', b'privileges", "seccomp={\\"defaultAction\\": \\"SCMP_ACT_ERRNO\\"}"]')
+    seccomp = json.dumps(next(one for one in DockerOptions().guard_security if one.startswith("seccomp=")))
+    guard = guard.replace(b'privileges"]', f'privileges", {seccomp}]'.encode())
     got = say(engine, request("POST /v1.41/containers/create", guard))
     assert (b"no guard has a right in" not in got) is good
     assert any(line.startswith("POST") for line in engine.lines) is good
@@ -611,6 +632,43 @@ def test_no_orchestrator_starts_what_the_node_made_to_look_at_an_image(engine: E
         assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
 
 
+def test_of_a_link_nobody_hears_where_it_leads(engine: Engine) -> None:
+    """An engine finds that out on the machine itself, where a link may lead by then."""
+    reports = "/run/skytether/instance/reports.json"
+    asks = request(f"HEAD /v1.41/containers/{ID}/archive?path={quote(reports, safe='')}")
+    got = say(engine, asks)
+    assert b"200 OK" in got
+    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
+    assert stat == {
+        "name": "reports.json",
+        "size": 1000,
+        "mode": 0o644,
+        "mtime": "2026-11-27T12:00:00Z",
+        "linkTarget": "",
+    }
+    engine.links = {reports}
+    got = say(engine, asks)
+    assert b"404 Not Found" in got
+    assert b"Path-Stat" not in got
+
+
+def test_why_an_engine_does_not_give_a_file_is_not_told(engine: Engine) -> None:
+    engine.file, engine.odd_files = b"lstat /root/secret: no such file or directory", True
+    got = say(engine, request(REPORT))
+    assert b"404 Not Found" in got
+    assert b"secret" not in got
+
+
+def test_no_file_is_read_where_the_engine_would_run_code_of_its_image_for_that(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "skytether.node.engine_gate.loads_late", lambda: "the engine would load libnss_x out of an image"
+    )
+    assert b"403 Forbidden" in say(engine, request(REPORT))
+    assert not any("/export" in line or (line.startswith("GET") and "/archive" in line) for line in engine.lines)
+
+
 REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Freports.json"
 DISK = tar(("disk", tarfile.BLKTYPE, b""), devmajor=8, devminor=0)
 
@@ -675,6 +733,43 @@ def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> 
     engine.volumes = [ours, {"Name": "database", "Options": {"o": "password=secret"}, "Labels": None}]
     got = say(engine, request("GET /v1.41/system/df?type=volume&verbose=1"))
     assert json.loads(got.partition(b"\r\n\r\n")[2]) == {"Volumes": [ours]}
+
+
+def test_of_many_labels_few_are_kept_in_memory() -> None:
+    """With 32 MB of them, an answer took all the memory that the node's program may have."""
+    labels = {"skytether.io/owner": "edge"} | {f"{i:x}": "" for i in range(20_000)}
+    text = json.dumps([{"Labels": labels}] * 40).encode()
+    tracemalloc.start()
+    try:
+        told = picked(text, "Labels", "skytether.io/owner")
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert told == [{"Labels": {"skytether.io/owner": "edge"}}] * 40
+    assert most < 2 * len(text)
+
+
+def test_a_container_that_no_engine_lets_go_of_holds_up_nobody_else(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its seccomp profile had it hang as it started; then a node that was started anew never made anything again."""
+    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.1)
+    joins = {"HostConfig": {"ReadonlyRootfs": True, "NetworkMode": f"container:{X}"}, "Mounts": []}
+    engine.running, engine.others = {X, Z}, {X: in_volumes("skytether-s"), Y: in_volumes("skytether-t"), Z: joins}
+    engine.paused = {X}
+    hangs, unpause = f"GET /containers/{Z}/json", f"POST /containers/{X}/unpause"
+    engine.slow = {hangs: threading.Event(), unpause: threading.Event()}
+
+    async def run() -> None:
+        site = Site(engine)
+        await asyncio.wait_for(site.start(Y), 5.0)
+        await asyncio.sleep(0.3)
+        assert unpause not in engine.lines, "while another one is just joining its network"
+        engine.slow[hangs].set()
+        await site.soon(unpause)
+        engine.slow[unpause].set()
+
+    asyncio.run(run())
 
 
 def test_a_refusal_takes_one_line_of_the_log_and_many_take_few(
@@ -981,6 +1076,30 @@ def test_what_is_put_into_a_container_is_put_there_before_it_was_ever_started(en
     engine.running = {ID}
     assert b"before it was ever started" in say(engine, puts)
     assert len([line for line in engine.lines if line.startswith("PUT")]) == 1
+
+
+@pytest.mark.parametrize(
+    "mounts",
+    [
+        [],
+        [{"Name": "skytether-shared", "Destination": "/run/skytether"}],
+        [OWN_VOLUME, {"Name": "skytether-shared", "Destination": "/run/skytether"}],
+        [{**OWN_VOLUME, "Destination": "/run"}],
+    ],
+)
+def test_a_grant_is_put_where_no_other_container_has_a_folder_of_it(engine: Engine, mounts: list[Any]) -> None:
+    """What had the same volume made it a link to a device of the image: the engine wrote to a disk of the machine."""
+    engine.container = {**engine.container, "Mounts": mounts}
+    archive = tar(*GRANT, ("instance/grant.json", FILE, b"a"))
+    puts = f"PUT /v1.41/containers/{ID}/archive?path="
+    assert b"a grant into a volume at /run/skytether that has no name" in say(
+        engine, request(f"{puts}%2Frun%2Fskytether", archive)
+    )
+    assert not any(line.startswith("PUT") for line in engine.lines)
+    data = tar(("instance-1", tarfile.DIRTYPE, b""))
+    assert b"200 OK" in say(engine, request(f"{puts}%2Fvar%2Flib%2Fskytether", data)), (
+        "folders go where others are, too"
+    )
 
 
 def test_what_has_ended_is_forgotten_before_there_is_no_room_for_more(engine: Engine) -> None:

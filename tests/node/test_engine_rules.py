@@ -28,7 +28,18 @@ from skytether.orchestrator.runtimes.docker.objects import (
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
 OWNER = {"skytether.io/owner": "edge"}
-SECURITY = ["no-new-privileges", 'seccomp={"defaultAction": "SCMP_ACT_ERRNO"}']
+NEEDED = {
+    "names": ["close", "close_range", "execve", "exit_group", "futex", "mmap", "openat", "read", "write"],
+    "action": "SCMP_ACT_ALLOW",
+}
+"""What runc calls."""
+
+
+def profile(*entries: dict[str, Any], **more: Any) -> str:
+    return json.dumps({"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [NEEDED, *entries], **more})
+
+
+SECURITY = ["no-new-privileges", f"seccomp={profile()}"]
 ID = "f" * 64
 JOINED = DockerOptions(engine="node://edge", advertise_host="192.0.2.1", seccomp="default")
 
@@ -208,6 +219,14 @@ HOST: dict[str, Any] = {
         ({"Mounts": [{"Type": "volume", "Source": "database", "Target": "/d"}]}, "the volume 'database', which is not"),
         ({"Mounts": [{"Type": "volume", "type": "bind", "Target": "/d"}]}, "a mount has 'type'"),
         (
+            {
+                "Mounts": [
+                    {"Type": "volume", "Target": "/d", "VolumeOptions": {"Labels": {str(i): "" for i in range(65)}}}
+                ]
+            },
+            "a volume of more than 64 labels",
+        ),
+        (
             {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"DriverConfig": {"Options": {}}}}]},
             "a volume has 'DriverConfig'",
         ),
@@ -313,6 +332,7 @@ def test_no_container_is_made_whose_health_check_ends_the_engine(check: Any, say
         ("POST", "/images/create", None, {"fromImage": "a/../b", "tag": "2"}),
         ("POST", "/volumes/prune", None, {}),
         ("POST", "/volumes/create", {"Name": "database", "Labels": OWNER}, {}),
+        ("POST", "/volumes/create", {"Name": "skytether-x", "Labels": OWNER | {str(i): "" for i in range(64)}}, {}),
         ("POST", "/volumes/create", {"Name": "skytether-x", "Labels": OWNER, "DriverOpts": {"device": "/"}}, {}),
         ("POST", "/networks/create", {"Name": "n", "Driver": "macvlan", "Labels": {"skytether.io/network": ""}}, {}),
         (
@@ -473,18 +493,39 @@ MORE = (
     ],
 )
 def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: bool) -> None:
-    assert holds(json.dumps({"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [entry]})) is good
+    assert holds(profile(entry)) is good
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        [],
+        [allowed(*(name for name in NEEDED["names"] if name != "close"))],
+        [{**NEEDED, "args": [OF_FAMILY]}],
+        [{**NEEDED, "includes": {"minKernel": "99.0"}}],
+        [{**NEEDED, "excludes": {"arches": ["amd64"]}}],
+        [NEEDED, {"names": ["close", "close_range"], "action": "SCMP_ACT_ERRNO"}],
+        [NEEDED, {"name": "close", "action": "SCMP_ACT_ERRNO"}],
+        [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": 0}],
+        [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": "38"}],
+    ],
+)
+def test_a_seccomp_profile_lets_runc_end(entries: list[dict[str, Any]]) -> None:
+    """Without ``close``, or with one that seems to go well, a start never ended, and so no other one by that engine."""
+    assert not holds(profile(syscalls=entries))
+    assert not holds(profile(defaultErrnoRet=0))
+    assert holds(profile(defaultErrnoRet=38))
 
 
 def test_what_a_profile_may_let_through_is_what_ours_does() -> None:
     """A node has no orchestrator's files, and so it has these names itself."""
-    profile = json.loads(next(row[8:] for row in DockerOptions().security if row.startswith("seccomp=")))
-    entries = [one for one in profile["syscalls"] if one["action"] == "SCMP_ACT_ALLOW"]
+    ours = json.loads(next(row[8:] for row in DockerOptions().security if row.startswith("seccomp=")))
+    entries = [one for one in ours["syscalls"] if one["action"] == "SCMP_ACT_ALLOW"]
     assert {name for one in entries for name in one["names"]} == CALLS
-    assert holds(json.dumps(profile))
+    assert holds(json.dumps(ours))
     for one in entries:
         if one.get("args"):
-            assert not holds(json.dumps({**profile, "syscalls": [{**one, "args": []}]})), one["names"]
+            assert not holds(json.dumps({**ours, "syscalls": [NEEDED, {**one, "args": []}]})), one["names"]
 
 
 @pytest.mark.parametrize(
@@ -504,7 +545,7 @@ def test_what_a_profile_may_let_through_is_what_ours_does() -> None:
 )
 def test_a_seccomp_profile_is_for_the_machines_own_calls_alone(arches: dict[str, Any], good: bool) -> None:
     """In 32 bits one call makes all sockets, and the filter does not see of which family."""
-    assert holds(json.dumps({"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [allowed("read")], **arches})) is good
+    assert holds(profile(**arches)) is good
 
 
 def made_by(*values: int, **more: Any) -> dict[str, Any]:
@@ -539,17 +580,16 @@ def test_by_the_profile_of_a_guard_nobody_asks_the_kernel_for_links_of_the_machi
     entry: dict[str, Any], good: bool
 ) -> None:
     """Its right is one over every network that a socket for routes can name, and it names the machine's by a number."""
-    profile = {"defaultAction": "SCMP_ACT_ERRNO", "syscalls": [entry]}
-    assert keeps_in(json.dumps(profile)) is good
+    assert keeps_in(profile(entry)) is good
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        '{"defaultAction": "SCMP_ACT_ALLOW"}',
-        '{"defaultAction": "SCMP_ACT_ERRNO", "DefaultAction": "SCMP_ACT_ALLOW"}',
-        '{"defaultAction": "SCMP_ACT_ALLOW", "defaultAction": "SCMP_ACT_ERRNO"}',
-        '{"defaultAction": "SCMP_ACT_ERRNO", "listenerPath": "/run/x"}',
+        profile(defaultAction="SCMP_ACT_ALLOW"),
+        profile(DefaultAction="SCMP_ACT_ALLOW"),
+        profile().replace("{", '{"defaultAction": "SCMP_ACT_ALLOW", ', 1),
+        profile(listenerPath="/run/x"),
         "unconfined",
         "[]",
         "[" * 100_000,

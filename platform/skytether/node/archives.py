@@ -36,7 +36,7 @@ _KERNEL = re.compile(r"/(?:dev|proc|sys)(?:/.*)?", re.DOTALL)
 _MOST_MOUNTS, _MOST_WAYS = 64, 512
 """Of a container, and folders on the ways to them: an engine mounts all of the first in the machine's own tree, which
 has room for some, whenever it looks into that container; the node asks for each of the second."""
-_STAT = "x-docker-container-path-stat"
+STAT = "X-Docker-Container-Path-Stat"
 _LINK, _NO_FILE = 1 << 27, 1 << 19
 """Go's bits in a file's mode: of a link, and the lowest of those that say that it is none."""
 _USERS = {"/etc/passwd", "/etc/group"}
@@ -46,7 +46,7 @@ _MOST_USERS = 1 << 20
 """Bytes in one of these."""
 _KNOWN = 4096
 _BLOCK = 512
-_EXPORT_SILENCE_S = 60.0
+_EXPORT_SILENCE_S = 20.0
 """For each piece of an image's files."""
 _FOLDERS = {FOLDER: re.compile("instance"), DATA: re.compile("[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80}")}
 """Folders that are put in each."""
@@ -130,13 +130,36 @@ def ways(inspected: Mapping[str, Any]) -> set[str]:
     return _USERS | {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
 
 
+def pull_stat(headers: Mapping[str, str]) -> dict[str, Any] | None:
+    """What an engine says of one file in the heads of its answer, whose names are in lower case."""
+    try:
+        stat = json.loads(base64.b64decode(headers[STAT.lower()]))
+        return {
+            "name": str(stat["name"]),
+            "size": int(stat["size"]),
+            "mode": int(stat["mode"]),
+            "mtime": str(stat["mtime"]),
+        }
+    except (LookupError, TypeError, ValueError):
+        return None
+
+
+def push_stat(stat: Mapping[str, Any]) -> str:
+    """The same as an engine says it; of no link."""
+    return base64.b64encode(json.dumps({**stat, "linkTarget": ""}).encode()).decode()
+
+
+def is_odd(stat: Mapping[str, Any]) -> bool:
+    """Whether it is no file, but a folder, a link, a device, or a pipe."""
+    return bool(stat["mode"] & -_NO_FILE)
+
+
 class Images:
     """Knows of images what is at paths in there. Asks one thing at a time, and waits for it."""
 
     def __init__(self, engine: str) -> None:
         """``engine``: path of its socket."""
         self._engine = engine
-        self._names = [f"{LOOK}{secrets.token_hex(4)}" for _ in range(2)]
         self._known: dict[tuple[str, str], bool] = {}
 
     def odd(self, image: str, paths: Iterable[str]) -> str | None:
@@ -150,7 +173,7 @@ class Images:
         """
         wanted = sorted(paths)
         if new := [path for path in wanted if (image, path) not in self._known]:
-            with self._made(image, self._names[0]) as container:
+            with self._made(image) as container:
                 found = {(image, path): self._is_odd(container, path) for path in new}
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
             return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
@@ -165,7 +188,7 @@ class Images:
             OSError: The engine does not answer.
             ValueError: It does not say, or there is too much in it.
         """
-        with self._made(image, self._names[1]) as container:
+        with self._made(image) as container:
             export = f"/containers/{container}/export"
             with answered(self._engine, export, patience=_EXPORT_SILENCE_S) as answer:
                 if answer.status != HTTPStatus.OK:
@@ -173,7 +196,7 @@ class Images:
                 return device_in(answer)
 
     @contextmanager
-    def _made(self, image: str, name: str) -> Iterator[str]:
+    def _made(self, image: str) -> Iterator[str]:
         """A container of an image, by its id.
 
         Raises:
@@ -190,7 +213,7 @@ class Images:
                 "SecurityOpt": ["no-new-privileges"],
             },
         }
-        self._remove(name)  # should it have been left
+        name = f"{LOOK}{secrets.token_hex(4)}"  # of its own: one that an engine is long about holds up no other
         made = ask(self._engine, f"/containers/create?name={name}", method="POST", body=body)
         if made.status != HTTPStatus.CREATED:
             raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
@@ -214,7 +237,9 @@ class Images:
             return False
         if answer.status != HTTPStatus.OK:
             raise ValueError(f"its engine says {answer.status} to {path}")
-        stat = json.loads(base64.b64decode(answer.headers[_STAT]))
+        stat = pull_stat(answer.headers)
+        if stat is None:
+            raise ValueError(f"its engine says nothing of {path}")
         if path in _USERS:
-            return bool(stat["mode"] & -_NO_FILE) or stat["size"] > _MOST_USERS
+            return is_odd(stat) or stat["size"] > _MOST_USERS
         return bool(stat["mode"] & _LINK)

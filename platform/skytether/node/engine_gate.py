@@ -22,8 +22,9 @@ from skytether.api.printable import printable
 from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
-from .archives import Images, cleaned, moved, ways
+from .archives import STAT, Images, cleaned, is_odd, moved, pull_stat, push_stat, ways
 from .engine_rules import (
+    FOLDER,
     MADE,
     NETWORK,
     NOBODY,
@@ -39,9 +40,10 @@ from .engine_rules import (
     plain,
     published,
 )
-from .machine import Answer, ask, is_taken
+from .machine import Answer, ask, is_taken, lean, picked
+from .names import loads_late
 from .registries import Registries
-from .removals import BusyError, Removals
+from .removals import BusyError, Removals, begun
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +75,8 @@ _KNOWN = 4096
 """Containers that are remembered to be ours."""
 _LOOK_THROUGH_S = 1.0
 """That somebody who asks for a file waits for a look through its image, which goes on if it takes longer."""
+_AGAIN_S = 300.0
+"""Until an image is looked through again in which an engine hung: it holds up looks at others."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
 _MADE_S, _MOST_NETWORKS = 60.0, 12
@@ -82,7 +86,7 @@ _MAKES = ("/containers/create", "/volumes/create")
 _JSON, _TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
-_WEIGH_S, _MOST_WEIGHED = 300.0, 32 << 20
+_WEIGH_S, _MOST_WEIGHED = 300.0, 16 << 20
 """What an engine may take to say how large all is that it has: seconds, and bytes."""
 
 
@@ -208,8 +212,10 @@ class EngineGate:
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
             return self._file(name, target)
+        if path.endswith("/archive") and call.method == "HEAD":
+            return self._stat(target)
         if path.endswith("/archive") and call.method == "PUT":
-            return self._put(name, target, archive)
+            return self._put(name, target, archive, call.query["path"])
         if kind == "containers" and path.endswith("/start"):
             return self._start(name, target)
         if call.method == "DELETE" and kind == "volumes":
@@ -305,13 +311,14 @@ class EngineGate:
         return found
 
     async def _start(self, container: str, target: str) -> tuple[int, bytes, str]:
-        found = await self._may_be_started(container)
-        return await self._kept(self._removals.start(container, found, target))
+        return await self._kept(self._removals.start(container, await self._may_be_started(container), target))
 
-    async def _put(self, container: str, target: str, archive: bytes) -> tuple[int, bytes, str]:
-        done = await self._tried(self._removals.put(container, target, archive))
+    async def _put(self, container: str, target: str, archive: bytes, where: str) -> tuple[int, bytes, str]:
+        own = FOLDER if where == FOLDER else ""  # elsewhere there are folders only
+        done = await self._tried(self._removals.put(container, target, archive, own))
         if done is None:
-            raise RefusedCall("what is put into a container is put there before it was ever started")
+            own = f", a grant into a volume at {FOLDER} that has no name"
+            raise RefusedCall(f"what is put into a container is put there before it was ever started{own}")
         return done.status, done.content, _JSON
 
     async def _kept(self, answer: Awaitable[Answer]) -> tuple[int, bytes, str]:
@@ -327,9 +334,19 @@ class EngineGate:
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
+    async def _stat(self, target: str) -> tuple[int, bytes, str]:
+        """Of a file. Where a link leads, or whether to something, an engine finds out on the machine itself."""
+        answer = await self._ask(target, method="HEAD")
+        stat = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
+        if stat is None or is_odd(stat):
+            return HTTPStatus.NOT_FOUND, b"", _JSON
+        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(stat)}"
+
     async def _file(self, container: str, target: str) -> tuple[int, bytes, str]:
         """An engine that waits until somebody takes the rest of a file lets nobody end its container."""
         if image := await self._may_be_opened(container):
+            if late := await asyncio.to_thread(loads_late):
+                raise RefusedCall(f"its files are not read: {late}")
             try:
                 if odd := await self._device(image):
                     raise RefusedCall(f"its files are not read: in its image, {odd}")
@@ -341,7 +358,9 @@ class EngineGate:
         answer = await self._ask(target, most=_MOST_FILE + 1)
         if len(answer.content) > _MOST_FILE:
             raise RefusedCall("the file is larger than those that a site asks for")
-        return answer.status, answer.content, _TAR if answer.status == HTTPStatus.OK else _JSON
+        if answer.status != HTTPStatus.OK:  # in words that name files of the machine, perhaps
+            return HTTPStatus.NOT_FOUND, b'{"message": "it has no such file"}', _JSON
+        return HTTPStatus.OK, answer.content, _TAR
 
     async def _device(self, image: str) -> str | None:
         """As `Images.device`; raises `BusyError` while that is not known yet. It is found out once."""
@@ -351,18 +370,21 @@ class EngineGate:
                 self._looks = {one: task for one, task in self._looks.items() if not task.done()}
             if len(self._looks) >= _KNOWN:
                 raise busy
-            self._looks[image] = asyncio.create_task(self._look_through(image))
+            self._looks[image] = begun(self._look_through(image))
         task = self._looks[image]
         await asyncio.wait((task,), timeout=_LOOK_THROUGH_S)
         if not task.done():
             raise busy
-        if task.cancelled() or task.exception():
-            self._looks.pop(image, None)  # whoever asks again has it tried again
         return task.result()
 
     async def _look_through(self, image: str) -> str | None:
         async with self._looking_through:
-            return await asyncio.to_thread(self._images.device, image)
+            try:
+                return await asyncio.to_thread(self._images.device, image)
+            except (OSError, ValueError) as error:  # whoever asks again has it tried again
+                after_s = _AGAIN_S if isinstance(error, OSError) else 0.0
+                asyncio.get_running_loop().call_later(after_s, self._looks.pop, image, None)
+                raise
 
     async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
         """A network, unless there are many of ours."""
@@ -385,7 +407,9 @@ class EngineGate:
         async with self._weighing:
             answer = await self._ask(target, patience=_WEIGH_S, most=_MOST_WEIGHED)
         try:
-            found = json.loads(answer.content)
+            found = picked(
+                answer.content, "Volumes", "VolumeUsage", "Items", "Name", "Labels", OWNER, "UsageData", "Size"
+            )
             volumes = found.get("Volumes") or (found.get("VolumeUsage") or {}).get("Items") or ()
             ours = [one for one in volumes if OWNER in (one.get("Labels") or ())]
         except (ValueError, AttributeError, TypeError) as error:
@@ -401,7 +425,7 @@ class EngineGate:
     async def _asked(self, path: str) -> tuple[int, Any]:
         answer = await self._ask(path)
         try:
-            return answer.status, json.loads(answer.content)
+            return answer.status, lean(answer.content)
         except ValueError as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 

@@ -80,6 +80,8 @@ _HOST = _LIMITS | {
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
+_MOST_LABELS = 64
+"""Of one thing: an engine tells of all of them whenever it lists what it has."""
 PORT = "7600/udp"
 """Inside: where a service's end of the bridge is."""
 _OURS = "skytether-"
@@ -159,6 +161,8 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> _Judgeme
         return "the call wants an object", ()
     if body is not None and not expects:
         return "the call has a body", ()
+    if expects and len(_at(body, "Labels")) > _MOST_LABELS:
+        return f"it has more than {_MOST_LABELS} labels", ()
     match kind:
         case "create":
             return _created(call, devices)
@@ -353,6 +357,8 @@ def _mount(mount: Any) -> str | None:
     if mount.get("Source") and options.get("NoCopy") is not True:
         # An engine writes into it from the outside, and follows a link that somebody who has it too puts there.
         return "it copies files of its image into a volume that others may have"
+    if len(_at(options, "Labels")) > _MOST_LABELS:
+        return f"it has a volume of more than {_MOST_LABELS} labels"
     return _only(options, {"Labels", "NoCopy"}, "a volume") or _only(
         mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount"
     )

@@ -30,6 +30,8 @@ _ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
 _ENGINE_S = 10.0
 _MOST = 1 << 20
 """Bytes of an engine's answer."""
+_HEAVY = {"Args", "Cmd", "Entrypoint", "Env", "ExposedPorts", "OnBuild", "Shell", "Volumes"}
+_OURS, _MOST_OF_ONE = "skytether", 4096
 _STATUS = re.compile(rb"HTTP/1\.[01] ([1-5]\d\d)\b")
 
 
@@ -174,6 +176,43 @@ async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -
     if not (found := _STATUS.match(head)):
         raise ValueError("it ended before it said whether it did it")
     return Answer(int(found[1]), {}, content)
+
+
+def lean(content: bytes) -> Any:
+    """JSON of what an engine has, without what takes much memory and says nothing that matters here.
+
+    Of labels ours are kept, and of what runs in a container nothing.
+
+    Raises:
+        ValueError: It is none, or there is much of something else.
+    """
+
+    def thin(found: dict[str, Any]) -> dict[str, Any]:
+        for key in _HEAVY & found.keys():
+            del found[key]
+        if isinstance(labels := found.get("Labels"), dict):
+            found["Labels"] = {key: value for key, value in labels.items() if key.startswith(_OURS)}
+        return found
+
+    found = json.loads(content, object_hook=thin)
+    if _is_long(found):
+        raise ValueError("it has too much of something")
+    return found
+
+
+def _is_long(found: Any) -> bool:
+    if not isinstance(found, dict | list):
+        return False
+    return len(found) > _MOST_OF_ONE or any(map(_is_long, found.values() if isinstance(found, dict) else found))
+
+
+def picked(content: bytes, *keys: str) -> Any:
+    """JSON of which objects have no other keys than these; of many labels, say, Python makes twenty times as much.
+
+    Raises:
+        ValueError: It is none.
+    """
+    return json.loads(content, object_hook=lambda found: {key: found[key] for key in keys if key in found})
 
 
 def free_mb(folder: str) -> int | None:

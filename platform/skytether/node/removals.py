@@ -12,6 +12,7 @@ import contextlib
 import json
 import logging
 import re
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from http import HTTPStatus
@@ -20,13 +21,15 @@ from urllib.parse import urlencode
 
 from .engine_rules import OWNER
 from .kin import Kin
-from .machine import Answer, ask, ask_long
+from .machine import Answer, ask, ask_long, picked
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
-_MOST_TOLD = 32 << 20
+_MOST_TOLD = 16 << 20
 """Bytes of what an engine says of many containers, or of all volumes."""
+_LOOK_BACK_S = 15.0
+"""In which containers are asked for, one by one, whether they run; after that, each is taken to."""
 _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
 _SETTLED_S = 3.0
@@ -37,6 +40,8 @@ _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
 _MOST_STARTS, _MOST_REMOVALS = 512, 128
 """Under way at a time: an engine may take its time for each, and whoever asked may be gone meanwhile."""
+_OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
+"""What asks an engine for all containers of orchestrators."""
 _VOLUME = "volume "
 """What volumes are known by, before their names: they may be named as containers are."""
 
@@ -80,8 +85,9 @@ class Removals:
 
     async def start(self, container: str, inspected: Mapping[str, Any], path: str) -> Answer:
         """Have the engine start one, which is kin of what it shares something with from now on."""
+        things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
+        del inspected  # it may be large, and from here on much is waited for
         await self.look_back()
-        things = (container, *_volumes(inspected), *_joined(inspected))
         if not self._kin.has_room(things):
             await self._forget_ended()
         await self._until_removed(things)
@@ -90,7 +96,7 @@ class Removals:
             raise BusyError("too many containers run or start, with too many volumes")
         if container in self._puts:
             raise BusyError("something is being put into it")
-        (joined,) = _joined(inspected) or ("",)
+        (joined,) = joins or ("",)
         if joined in self._ending:
             raise BusyError("the container whose network it joins is being ended")
         self._kin.meet(things)
@@ -101,7 +107,7 @@ class Removals:
         if (task := self._starts.get(container)) is None:
             if joined:
                 self._joined[joined] += 1
-            task = self._starts[container] = _begun(self._start(path, joined))
+            task = self._starts[container] = begun(self._start(path, joined))
             task.add_done_callback(lambda _: self._starts.pop(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
 
@@ -148,21 +154,30 @@ class Removals:
             if not self._ending[container]:
                 del self._ending[container]
 
-    async def put(self, container: str, path: str, archive: bytes) -> Answer | None:
-        """Have the engine unpack an archive in one that was never started; None: it was.
+    async def put(self, container: str, path: str, archive: bytes, own: str = "") -> Answer | None:
+        """Have the engine unpack an archive in one that was never started; None: it was, or has no such volume.
 
-        An engine writes through a link to a device that what runs there makes meanwhile.
+        An engine writes through a link to a device of the image that somebody makes there meanwhile: what runs in it,
+        or another one that has its volume.
+
+        Args:
+            container: Its id.
+            path: Path and query.
+            archive: What is unpacked.
+            own: Where a volume must be that it alone has, for files are written there; empty: there is no file.
         """
         await self.look_back()
-        found = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
-        state = json.loads(found.content).get("State") or {} if found.status == HTTPStatus.OK else {}
-        if container in self._mine or state.get("Status") != "created":
+        answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
+        found = json.loads(answer.content) if answer.status == HTTPStatus.OK else {}
+        if container in self._mine or (found.get("State") or {}).get("Status") != "created":
+            return None
+        names = [str(one.get("Name")) for one in found.get("Mounts") or () if one.get("Destination") == own]
+        if own and not (names and all(map(_OWN.fullmatch, names))):
             return None
         self._puts.add(container)
-        try:
-            return await ask_long(self._engine, path, method="PUT", archive=archive)
-        finally:
-            self._puts.discard(container)
+        task = begun(ask_long(self._engine, path, method="PUT", archive=archive))
+        task.add_done_callback(lambda _: self._puts.discard(container))
+        return await asyncio.shield(task)  # the engine goes on with it, whoever waits for it: no start overtakes it
 
     async def remove_container(self, container: str, path: str, without: str) -> Answer:
         """Have the engine remove one, with its volumes if nobody else can have a folder of these.
@@ -202,7 +217,7 @@ class Removals:
         """
         if len(self._removals) >= _MOST_REMOVALS:
             raise BusyError("too much is being removed")
-        task = _begun(self._remove(things, path, itself, named=named))
+        task = begun(self._remove(things, path, itself, named=named))
         self._removals[task] = things
         task.add_done_callback(self._removals.pop)
         return await asyncio.shield(task)
@@ -244,13 +259,28 @@ class Removals:
     async def _learn(self) -> None:
         if self._looked_back:  # meanwhile
             return
-        if old := {one for one in await self._listed() if await self._may_run(one)}:
-            for container in old:  # an earlier program may have ended while it had one paused
-                with contextlib.suppress(OSError, ValueError):
-                    await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
-            volumes = (await self._told("/volumes"))["Volumes"] or ()
+        asked_until = time.monotonic() + _LOOK_BACK_S
+        there = await self._told(f"/containers/json?{_OURS}", "Id", "State", "HostConfig", "NetworkMode")
+        listed = {str(one["Id"]): one for one in there}
+        if old := {one for one in listed if time.monotonic() > asked_until or await self._may_run(one)}:
+            for paused in old:
+                if listed[paused].get("State") != "paused":
+                    continue
+                joining = [one for one in old if _joined(listed[one]) == (paused,)]
+                begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
+            volumes = (await self._told("/volumes", "Volumes", "Name"))["Volumes"] or ()
             self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
         self._looked_back = True
+
+    async def _unpause(self, container: str, joining: Iterable[str]) -> None:
+        """An earlier program may have ended while it had it paused, for others that joined its network."""
+        async with self._pauses.setdefault(container, asyncio.Lock()):
+            for one in joining:
+                while not await self._is_settled(one):
+                    await asyncio.sleep(_SETTLED_S)
+            await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+        if container not in self._joined:
+            self._pauses.pop(container, None)
 
     async def _running(self, things: Iterable[str]) -> set[str]:
         """Those of these containers that run, or may."""
@@ -275,9 +305,17 @@ class Removals:
             )
             if answer.status == HTTPStatus.NOT_FOUND:
                 return False
-            return json.loads(answer.content)["State"]["Running"] is not False
+            return picked(answer.content, "State", "Running")["State"]["Running"] is not False
         except (OSError, ValueError, LookupError, TypeError):
             return True
+
+    async def _is_settled(self, container: str) -> bool:
+        """Whether an engine says anything of it: not while it starts it."""
+        try:
+            await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+        except (OSError, ValueError):
+            return False
+        return True
 
     async def _strangers_run(self) -> bool:
         """Whether any runs that another program of a node started: whom that has met nobody here has seen."""
@@ -293,20 +331,22 @@ class Removals:
 
     async def _listed(self) -> set[str]:
         """All containers of orchestrators."""
-        asked = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
-        return {str(one["Id"]) for one in await self._told(f"/containers/json?{asked}")}
+        return {str(one["Id"]) for one in await self._told(f"/containers/json?{_OURS}", "Id")}
 
-    async def _told(self, path: str) -> Any:
+    async def _told(self, path: str, *keys: str) -> Any:
+        """Of each thing what has one of these keys."""
+
         def tell() -> Any:
             answer = ask(self._engine, path, most=_MOST_TOLD)
             if answer.status != HTTPStatus.OK:
                 raise ValueError(f"it answers {answer.status}")
-            return json.loads(answer.content)
+            return picked(answer.content, *keys)
 
         return await asyncio.to_thread(tell)
 
 
-def _begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
+def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
+    """A task that goes on whoever waits for it, and whose failure need not be read."""
     task = asyncio.create_task(work)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
     return task

@@ -28,6 +28,8 @@ _FAMILIES = {1, 2, 10, 16}
 one, which has no network of its own for each container."""
 _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "value": 12, "op": "SCMP_CMP_EQ"}]
 """Arguments of sockets of AF_NETLINK, that for netfilter."""
+_NEEDED = {"close", "close_range", "execve", "exit_group", "futex", "mmap", "openat", "read", "write"}
+"""What runc calls by a container's profile before it is that container. Without one, it may never end, nor start."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
 _ARGUMENT = {"index", "value", "valueTwo", "op"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
@@ -41,13 +43,21 @@ def holds(text: str) -> bool:
         return False
     if not isinstance(profile, dict) or profile.keys() - _PROFILE or not _refuses(profile.get("defaultAction")):
         return False
+    if not _is_error(profile.get("defaultErrnoRet")):
+        return False
     arches, maps = profile.get("architectures") or [], profile.get("archMap") or []
     if not isinstance(arches, list) or set(map(str, arches)) - _NATIVE:
         return False
     if not isinstance(maps, list) or not all(map(_is_alone, maps)):
         return False
     entries = profile.get("syscalls") or []
-    return isinstance(entries, list) and all(isinstance(one, dict) and _closed(one) for one in entries)
+    if not isinstance(entries, list) or not all(isinstance(one, dict) and _closed(one) for one in entries):
+        return False
+    for one in entries:
+        if _refuses(one.get("action")) and not _NEEDED.isdisjoint(_named(one)):
+            return False
+    always = (one for one in entries if not any(one.get(key) for key in ("args", "includes", "excludes")))
+    return {name for one in always if not _refuses(one.get("action")) for name in _named(one)} >= _NEEDED
 
 
 def keeps_in(text: str) -> bool:
@@ -71,9 +81,18 @@ def _is_alone(arches: Any) -> bool:
 
 
 def _makes_few(entry: Mapping[str, Any]) -> bool:
-    names = [*(entry.get("names") or []), entry.get("name")]
+    names = _named(entry)
     made = "socketpair" not in names and ("socket" not in names or entry.get("args") == _OF_FILTERS)
     return made or _refuses(entry.get("action"))
+
+
+def _named(entry: Mapping[str, Any]) -> set[Any]:
+    return {*(entry.get("names") or []), entry.get("name")} - {None, ""}
+
+
+def _is_error(number: Any) -> bool:
+    """By zero a call that was not made seems to have gone well."""
+    return number is None or (type(number) is int and number > 0)
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -88,12 +107,14 @@ def _closed(entry: Mapping[str, Any]) -> bool:
     names, includes = entry.get("names") or [], entry.get("includes") or {}
     if entry.keys() - _ENTRY or not isinstance(names, list) or not isinstance(includes, dict):
         return False
+    if not _is_error(entry.get("errnoRet")) or not all(isinstance(one, str) for one in (*names, entry.get("name", ""))):
+        return False
     if includes.keys() - {"caps", "arches", "minKernel"} or not isinstance(includes.get("caps") or [], list):
         return False
     if _refuses(entry.get("action")) or set(map(str, includes.get("caps") or [])) - _GUARDS:
         return True
-    allowed = [*names, *filter(None, [entry.get("name")])]
-    if not all(isinstance(name, str) and name in CALLS for name in allowed):
+    allowed = _named(entry)
+    if not allowed <= CALLS:
         return False
     if "socket" in allowed and not _of_known_families(entry.get("args")):
         return False
