@@ -662,9 +662,7 @@ def test_why_an_engine_does_not_give_a_file_is_not_told(engine: Engine) -> None:
 def test_no_file_is_read_where_the_engine_would_run_code_of_its_image_for_that(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "skytether.node.engine_gate.loads_late", lambda: "the engine would load libnss_x out of an image"
-    )
+    monkeypatch.setattr("skytether.node.files.loads_late", lambda: "the engine would load libnss_x out of an image")
     assert b"403 Forbidden" in say(engine, request(REPORT))
     assert not any("/export" in line or (line.startswith("GET") and "/archive" in line) for line in engine.lines)
 
@@ -683,7 +681,7 @@ def test_no_file_is_read_of_a_container_whose_image_has_a_disk(engine: Engine) -
 def test_while_an_image_is_looked_through_whoever_asks_is_told_to_ask_again(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("skytether.node.engine_gate._LOOK_THROUGH_S", 0.05)
+    monkeypatch.setattr("skytether.node.files._LOOK_THROUGH_S", 0.05)
     line = REPORT.partition(" ")[2]
 
     async def run() -> None:

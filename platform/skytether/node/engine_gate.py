@@ -19,10 +19,10 @@ from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlencode
 
 from skytether.api.printable import printable
-from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import Stream
 
-from .archives import STAT, Images, cleaned, is_odd, moved, pull_stat, push_stat, ways
+from .archives import cleaned
+from .asking import JSON, Asking, RefusedCall
 from .engine_rules import (
     FOLDER,
     MADE,
@@ -40,10 +40,10 @@ from .engine_rules import (
     plain,
     published,
 )
-from .machine import Answer, ask, is_taken, lean, picked
-from .names import loads_late
+from .files import Files
+from .machine import Answer, is_taken, picked
 from .registries import Registries
-from .removals import BusyError, Removals, begun
+from .removals import BusyError, Removals
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +55,6 @@ believes it before the query."""
 _MOST_JSON, _MOST_ARCHIVE = 1 << 18, 2 << 20
 """Bytes of a request's body; an archive holds a grant, with what a robot asked for. Of JSON, what was read takes forty
 times as much."""
-_MOST_FILE = MOST_BYTES + (8 << 10)
-"""Of the archive of one file, which is one of reports: the file, and some heads of 512 bytes."""
 _MOST_DIGITS = 12
 """Of a length."""
 _LARGE, _MOST_LARGE, _BODY_S = 1 << 15, 16, 20.0
@@ -73,29 +71,16 @@ _MARKS = {
 """By kind, labels of which one makes a thing ours."""
 _KNOWN = 4096
 """Containers that are remembered to be ours."""
-_LOOK_THROUGH_S = 1.0
-"""That somebody who asks for a file waits for a look through its image, which goes on if it takes longer."""
-_AGAIN_S = 300.0
-"""Until an image is looked through again in which an engine hung: it holds up looks at others."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
 _MADE_S, _MOST_NETWORKS = 60.0, 12
 """For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
 take them all has addresses that the machine knows elsewhere."""
 _MAKES = ("/containers/create", "/volumes/create")
-_JSON, _TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S, _MOST_WEIGHED = 300.0, 16 << 20
 """What an engine may take to say how large all is that it has: seconds, and bytes."""
-
-
-class RefusedCall(Exception):  # noqa: N818 (an answer)
-    """One sentence."""
-
-    def __init__(self, text: str, status: HTTPStatus = HTTPStatus.FORBIDDEN) -> None:
-        super().__init__(text)
-        self.status = status
 
 
 class EngineGate:
@@ -113,17 +98,14 @@ class EngineGate:
         self._registries = Registries(registries)
         self._devices = devices
         self._ours: set[str] = set()
-        self._opened: dict[str, str] = {}
-        """Containers into whose files the engine may look, and their images."""
-        self._looks: dict[str, asyncio.Task[str | None]] = {}
-        """By image that is looked through, or was."""
-        self._images = Images(engine)
         self._removals = Removals(engine)
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
         self._large = asyncio.Semaphore(_MOST_LARGE)
-        self._looking, self._weighing, self._making = asyncio.Lock(), asyncio.Lock(), asyncio.Lock()
-        self._looking_through = asyncio.Lock()
+        self._weighing, self._making = asyncio.Lock(), asyncio.Lock()
+        asking = Asking(engine)
+        self._ask, self._asked = asking.ask, asking.asked
+        self._files = Files(engine, asking)
 
     async def pass_requests(self, asks: Stream, engine: Stream) -> None:
         """Until the one who asks has ended, or was refused something."""
@@ -140,7 +122,7 @@ class EngineGate:
             if not gone:
                 self._warn_once(printable(str(error), lines=False))
             with contextlib.suppress(OSError):
-                await _answer(back, status, json.dumps({"message": text}).encode(), f"{_JSON}\r\nConnection: close")
+                await _answer(back, status, json.dumps({"message": text}).encode(), f"{JSON}\r\nConnection: close")
 
     def _warn_once(self, text: str) -> None:
         """Each once, and a few of them."""
@@ -211,9 +193,9 @@ class EngineGate:
         if SEEN.fullmatch(path) and call.method == "GET":
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
-            return self._file(name, target)
+            return self._files.read(name, target)
         if path.endswith("/archive") and call.method == "HEAD":
-            return self._stat(target)
+            return self._files.stat(target)
         if path.endswith("/archive") and call.method == "PUT":
             return self._put(name, target, archive, call.query["path"])
         if kind == "containers" and path.endswith("/start"):
@@ -246,7 +228,7 @@ class EngineGate:
             elif not await self._is_ours(subject):
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
         if call.path.endswith("/archive"):
-            await self._may_be_opened(subjects[0][1])
+            await self._files.may_be_opened(subjects[0][1])
         elif plain(call.path) in _MAKES:
             await self._tried(self._removals.look_back())
         elif plain(call.path).endswith("/connect"):
@@ -270,26 +252,6 @@ class EngineGate:
         if not await self._is_ours(("kept networks", mode)):
             raise RefusedCall(f"no guard has a right in {mode[:80]}, which no orchestrator made")
 
-    async def _may_be_opened(self, container: str) -> str:
-        """Its image, empty if it is gone; raises unless the engine may look into its files."""
-        if container in self._opened:
-            return self._opened[container]
-        status, found = await self._asked(f"/containers/{container}/json")
-        if status == HTTPStatus.NOT_FOUND:
-            return ""
-        if status != HTTPStatus.OK or (refused := moved(found)):
-            raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
-        try:
-            async with self._looking:
-                odd = await asyncio.to_thread(self._images.odd, str(found["Image"]), ways(found))
-        except (OSError, ValueError) as error:
-            raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-        if odd:
-            raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file, or a large one")
-        self._opened = self._opened if len(self._opened) < _KNOWN else {}
-        self._opened[container] = str(found["Image"])
-        return self._opened[container]
-
     async def _may_be_started(self, container: str) -> Any:
         """What the engine says of it; raises unless its networks are ours still: by their names it is connected.
 
@@ -307,7 +269,7 @@ class EngineGate:
                 if (await self._asked(f"/networks/{name}"))[0] == HTTPStatus.NOT_FOUND:
                     raise RefusedCall(f"network {name} not found", HTTPStatus.NOT_FOUND)
                 raise RefusedCall(f"{name[:80]} is not of an orchestrator")
-        await self._may_be_opened(container)
+        await self._files.may_be_opened(container)
         return found
 
     async def _start(self, container: str, target: str) -> tuple[int, bytes, str]:
@@ -319,12 +281,12 @@ class EngineGate:
         if done is None:
             own = f", a grant into a volume at {FOLDER} that has no name"
             raise RefusedCall(f"what is put into a container is put there before it was ever started{own}")
-        return done.status, done.content, _JSON
+        return done.status, done.content, JSON
 
     async def _kept(self, answer: Awaitable[Answer]) -> tuple[int, bytes, str]:
         """Of what was started or removed."""
         done = await self._tried(answer)
-        return done.status, done.content, _JSON
+        return done.status, done.content, JSON
 
     async def _tried(self, work: Awaitable[_T]) -> _T:
         try:
@@ -334,58 +296,6 @@ class EngineGate:
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
-    async def _stat(self, target: str) -> tuple[int, bytes, str]:
-        """Of a file. Where a link leads, or whether to something, an engine finds out on the machine itself."""
-        answer = await self._ask(target, method="HEAD")
-        stat = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
-        if stat is None or is_odd(stat):
-            return HTTPStatus.NOT_FOUND, b"", _JSON
-        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(stat)}"
-
-    async def _file(self, container: str, target: str) -> tuple[int, bytes, str]:
-        """An engine that waits until somebody takes the rest of a file lets nobody end its container."""
-        if image := await self._may_be_opened(container):
-            if late := await asyncio.to_thread(loads_late):
-                raise RefusedCall(f"its files are not read: {late}")
-            try:
-                if odd := await self._device(image):
-                    raise RefusedCall(f"its files are not read: in its image, {odd}")
-            except BusyError as error:
-                return HTTPStatus.SERVICE_UNAVAILABLE, json.dumps({"message": str(error)}).encode(), _JSON
-            except (OSError, ValueError) as error:
-                why = f"its image is not looked through: {error}"
-                raise RefusedCall(why, HTTPStatus.SERVICE_UNAVAILABLE) from error
-        answer = await self._ask(target, most=_MOST_FILE + 1)
-        if len(answer.content) > _MOST_FILE:
-            raise RefusedCall("the file is larger than those that a site asks for")
-        if answer.status != HTTPStatus.OK:  # in words that name files of the machine, perhaps
-            return HTTPStatus.NOT_FOUND, b'{"message": "it has no such file"}', _JSON
-        return HTTPStatus.OK, answer.content, _TAR
-
-    async def _device(self, image: str) -> str | None:
-        """As `Images.device`; raises `BusyError` while that is not known yet. It is found out once."""
-        busy = BusyError(f"image {image} is being looked through for files of devices: ask again")
-        if image not in self._looks:
-            if len(self._looks) >= _KNOWN:
-                self._looks = {one: task for one, task in self._looks.items() if not task.done()}
-            if len(self._looks) >= _KNOWN:
-                raise busy
-            self._looks[image] = begun(self._look_through(image))
-        task = self._looks[image]
-        await asyncio.wait((task,), timeout=_LOOK_THROUGH_S)
-        if not task.done():
-            raise busy
-        return task.result()
-
-    async def _look_through(self, image: str) -> str | None:
-        async with self._looking_through:
-            try:
-                return await asyncio.to_thread(self._images.device, image)
-            except (OSError, ValueError) as error:  # whoever asks again has it tried again
-                after_s = _AGAIN_S if isinstance(error, OSError) else 0.0
-                asyncio.get_running_loop().call_later(after_s, self._looks.pop, image, None)
-                raise
-
     async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
         """A network, unless there are many of ours."""
         async with self._making:
@@ -393,14 +303,14 @@ class EngineGate:
             if status != HTTPStatus.OK or len(found) >= _MOST_NETWORKS:
                 raise RefusedCall(f"orchestrators made {_MOST_NETWORKS} networks here, as many as they may")
             answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
-        return answer.status, answer.content, _JSON
+        return answer.status, answer.content, JSON
 
     async def _network(self, target: str) -> tuple[int, bytes, str]:
         """One that is open has containers of the machine's owner, too: nothing of them."""
         status, found = await self._asked(target)
         if isinstance(found, dict):
             found = {key: value for key, value in found.items() if key not in ("Containers", "Peers", "Services")}
-        return status, json.dumps(found).encode(), _JSON
+        return status, json.dumps(found).encode(), JSON
 
     async def _weigh(self, target: str) -> tuple[int, bytes, str]:
         """Of what there is what is ours."""
@@ -414,20 +324,7 @@ class EngineGate:
             ours = [one for one in volumes if OWNER in (one.get("Labels") or ())]
         except (ValueError, AttributeError, TypeError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-        return HTTPStatus.OK, json.dumps({"Volumes": ours}).encode(), _JSON
-
-    async def _ask(self, path: str, **how: Any) -> Answer:
-        try:
-            return await asyncio.to_thread(ask, self._engine, path, **how)
-        except (OSError, ValueError) as error:
-            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-
-    async def _asked(self, path: str) -> tuple[int, Any]:
-        answer = await self._ask(path)
-        try:
-            return answer.status, lean(answer.content)
-        except ValueError as error:
-            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+        return HTTPStatus.OK, json.dumps({"Volumes": ours}).encode(), JSON
 
     async def _is_ours(self, subject: Subject) -> bool:
         """Whether an orchestrator made it, or there is none: the engine says that itself."""
