@@ -8,6 +8,7 @@ import contextlib
 import gzip
 import io
 import json
+import os
 import socket
 import socketserver
 import tarfile
@@ -23,12 +24,14 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
 
+from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
 from skytether.node.registries import registry_of
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
+from skytether.orchestrator.runtimes.docker.reports import unpacked
 
 ID, OTHER = "f" * 64, "e" * 64
 CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConfig": {"NetworkMode": "%s",
@@ -75,12 +78,6 @@ class Engine:
         """It lists no containers."""
         self.slow: dict[str, threading.Event] = {}
         """By what it is asked, what it waits for before it answers."""
-        self.file = b""
-        """What is in its containers."""
-        self.export = tar(("dev/null", tarfile.CHRTYPE, b""), devmajor=1, devminor=3)
-        """What is in its images."""
-        self.odd_files = False
-        """It does not give these."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
         engine = self
@@ -132,11 +129,6 @@ class Engine:
                         name not in engine.networks,
                         json.dumps({"Labels": engine.networks.get(name), "Containers": {"of others": {}}}).encode(),
                     )
-                if self.command == "GET" and "/archive" in self.path:
-                    text = engine.file
-                if self.path.endswith("/export"):
-                    text = engine.export
-                missing = missing or (engine.odd_files and self.command == "GET" and "/archive" in self.path)
                 self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {
@@ -354,15 +346,6 @@ def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -
         assert engine.asked[-1][2] == archive
 
     asyncio.run(run())
-
-
-def test_of_a_file_no_more_is_fetched_than_reports_have(engine: Engine) -> None:
-    """An engine that waits until somebody takes the rest of it lets nobody end the container."""
-    asked = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
-    engine.file = bytes(range(256)) * 40
-    assert say(engine, asked).endswith(engine.file)
-    engine.file = bytes(1 << 20)
-    assert b"larger than those that a site asks for" in say(engine, asked)
 
 
 def test_orchestrators_make_some_networks_and_not_all_that_an_engine_has_room_for(engine: Engine) -> None:
@@ -601,12 +584,12 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     engine: Engine, mounts: list[Any], changes: dict[str, Any], links: set[str], says: bytes
 ) -> None:
     engine.container, engine.links = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": mounts, **changes}, links
-    sent = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    sent = request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
     got = say(engine, sent + sent)
     if not says:
         assert got.count(b"200 OK") == 2
         made = [line for line in engine.lines if line.startswith("POST /containers/create")]
-        assert len(made) == 2  # for the ways, and to look through it; each once
+        assert len(made) == 1
         assert f"DELETE /containers/{ID}?force=1&v=1" in engine.lines
     else:
         assert says in got
@@ -616,7 +599,7 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
 def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Engine) -> None:
     """Where nothing is any more no link is found."""
     engine.emptied = True
-    sent = request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    sent = request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
     assert b"was removed meanwhile" in say(engine, sent)
     engine.emptied = False
     assert b"200 OK" in say(engine, sent)
@@ -624,12 +607,10 @@ def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Eng
 
 def test_no_orchestrator_starts_what_the_node_made_to_look_at_an_image(engine: Engine) -> None:
     """That image may say of itself whose it is, and have volumes that make the look a false one."""
-    say(engine, request(f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json"))
-    all_made = [json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create")]
-    assert len(all_made) == 2
-    for made in all_made:
-        engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
-        assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
+    say(engine, request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json"))
+    (made,) = [json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create")]
+    engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
+    assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
 
 
 def test_of_a_link_nobody_hears_where_it_leads(engine: Engine) -> None:
@@ -652,78 +633,74 @@ def test_of_a_link_nobody_hears_where_it_leads(engine: Engine) -> None:
     assert b"Path-Stat" not in got
 
 
-def test_why_an_engine_does_not_give_a_file_is_not_told(engine: Engine) -> None:
-    engine.file, engine.odd_files = b"lstat /root/secret: no such file or directory", True
+REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Freports.json"
+
+
+@pytest.fixture
+def reports(engine: Engine, tmp_path: Path) -> Path:
+    """Where the container's are, in its volume."""
+    folder = tmp_path / "volume" / "instance"
+    folder.mkdir(parents=True)
+    mounted = {**OWN_VOLUME, "Type": "volume", "Driver": "local", "Source": str(folder.parent)}
+    engine.container = {**engine.container, "Mounts": [mounted]}
+    return folder / "reports.json"
+
+
+def test_a_report_is_read_by_the_node_itself(engine: Engine, reports: Path) -> None:
+    """Docker's process for that is root of the machine, and asks in there by what names their owners are called."""
+    reports.write_bytes(b"[1, 2]")
+    got = say(engine, request(REPORT))
+    assert b"200 OK" in got
+    assert b"application/x-tar" in got
+    assert unpacked(got.partition(b"\r\n\r\n")[2]) == [1, 2]
+    assert not any("/archive" in line or line.startswith("POST") for line in engine.lines)
+
+
+def make_odd(report: Path, how: str) -> None:
+    secret = report.parents[2] / "secret"
+    secret.write_bytes(b"secret")
+    match how:
+        case "a link":
+            report.symlink_to(secret)
+        case "a link on the way":
+            (report.parents[2] / "elsewhere").mkdir()
+            (report.parents[2] / "elsewhere" / "reports.json").write_bytes(b"secret")
+            report.parent.rmdir()
+            report.parent.symlink_to("../elsewhere")
+        case "a pipe":
+            os.mkfifo(report)
+        case "a socket":
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(str(report))
+        case "a folder":
+            report.mkdir()
+        case "large":
+            report.write_bytes(b" " * (MOST_BYTES + 1))
+
+
+@pytest.mark.parametrize("how", ["a link", "a link on the way", "a pipe", "a socket", "a folder", "large", "nothing"])
+def test_of_what_is_no_report_nothing_is_read(engine: Engine, reports: Path, how: str) -> None:
+    make_odd(reports, how)
     got = say(engine, request(REPORT))
     assert b"404 Not Found" in got
     assert b"secret" not in got
 
 
-def test_no_file_is_read_where_the_engine_would_run_code_of_its_image_for_that(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("skytether.node.files.loads_late", lambda: "the engine would load libnss_x out of an image")
-    assert b"403 Forbidden" in say(engine, request(REPORT))
-    assert not any("/export" in line or (line.startswith("GET") and "/archive" in line) for line in engine.lines)
+@pytest.mark.parametrize(
+    "changes", [{"Type": "bind"}, {"Driver": "nfs"}, {"Destination": "/run"}, {"Source": "/nowhere"}]
+)
+def test_only_a_volume_of_this_machine_has_reports(engine: Engine, reports: Path, changes: dict[str, str]) -> None:
+    reports.write_bytes(b"[1, 2]")
+    engine.container["Mounts"][0] |= changes
+    assert b"404 Not Found" in say(engine, request(REPORT))
 
 
-REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Freports.json"
-DISK = tar(("disk", tarfile.BLKTYPE, b""), devmajor=8, devminor=0)
+def test_a_node_that_may_not_read_reports_says_so(engine: Engine, reports: Path, monkeypatch: Any) -> None:
+    def refuse(*_: Any) -> None:
+        raise PermissionError(13, "Permission denied", str(reports))
 
-
-def test_no_file_is_read_of_a_container_whose_image_has_a_disk(engine: Engine) -> None:
-    """The file becomes a link to it while the engine reads, and the engine may read any disk."""
-    engine.export = DISK
-    assert b"its files are not read: in its image, disk is a device" in say(engine, request(REPORT))
-    assert not any(line.startswith("GET") and "/archive" in line for line in engine.lines)
-
-
-def test_while_an_image_is_looked_through_whoever_asks_is_told_to_ask_again(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("skytether.node.files._LOOK_THROUGH_S", 0.05)
-    line = REPORT.partition(" ")[2]
-
-    async def run() -> None:
-        site = Site(engine)
-        engine.slow[f"GET /containers/{ID}/export"] = threading.Event()
-        for _ in range(2):
-            said = await site.ask(f"GET {line}")
-            assert b"503" in said
-            assert b"is being looked through for files of devices: ask again" in said
-            assert b"Connection: close" not in said
-        engine.slow.popitem()[1].set()
-        async with asyncio.timeout(10):
-            while b"200 OK" not in await site.ask(f"GET {line}"):
-                await asyncio.sleep(0.01)
-        assert len([asked for asked in engine.lines if asked.endswith("/export")]) == 1
-
-    asyncio.run(run())
-
-
-def test_a_look_through_that_fails_is_tried_again(engine: Engine) -> None:
-    async def run() -> None:
-        site = Site(engine)
-        whole, engine.export = engine.export, engine.export[:600]
-        assert b"its image is not looked through: its engine sends half of an archive" in await site.ask(REPORT)
-        engine.export = whole
-        assert b"200 OK" in await site.ask(REPORT)
-
-    asyncio.run(run())
-
-
-def test_an_engine_that_falls_silent_in_a_look_through_is_told_as_that(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("skytether.node.archives._EXPORT_SILENCE_S", 0.05)
-    engine.slow[f"GET /containers/{ID}/export"] = threading.Event()
-
-    async def run() -> bytes:
-        said = await Site(engine).ask(REPORT)
-        engine.slow.popitem()[1].set()
-        return said
-
-    assert b"its image is not looked through: timed out" in asyncio.run(run())
+    monkeypatch.setattr("skytether.node.files.read_beneath", refuse)
+    assert b"add CapabilityBoundingSet=CAP_DAC_READ_SEARCH to the node's unit" in say(engine, request(REPORT))
 
 
 def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> None:

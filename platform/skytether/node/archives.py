@@ -25,9 +25,8 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from .devices import device_in
 from .engine_rules import DATA, FOLDER, LOOK, NOBODY, OWNER
-from .machine import answered, ask
+from .machine import ask
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
@@ -46,8 +45,6 @@ _MOST_USERS = 1 << 20
 """Bytes in one of these."""
 _KNOWN = 4096
 _BLOCK = 512
-_EXPORT_SILENCE_S = 20.0
-"""For each piece of an image's files."""
 _FOLDERS = {FOLDER: re.compile("instance"), DATA: re.compile("[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80}")}
 """Folders that are put in each."""
 _GRANT = "instance/grant.json"
@@ -178,22 +175,6 @@ class Images:
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
             return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
         return next((path for path in wanted if self._known[image, path]), None)
-
-    def device(self, image: str) -> str | None:
-        """A file of a device in an image that is not for everybody, as `device_in` gives it; None: there is none.
-
-        Takes a second for some 70 MB. May be asked while `odd` is, and not twice at a time.
-
-        Raises:
-            OSError: The engine does not answer.
-            ValueError: It does not say, or there is too much in it.
-        """
-        with self._made(image) as container:
-            export = f"/containers/{container}/export"
-            with answered(self._engine, export, patience=_EXPORT_SILENCE_S) as answer:
-                if answer.status != HTTPStatus.OK:
-                    raise ValueError(f"its engine says {answer.status} to {export}")
-                return device_in(answer)
 
     @contextmanager
     def _made(self, image: str) -> Iterator[str]:

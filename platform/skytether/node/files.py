@@ -1,26 +1,27 @@
-"""Files in containers, as far as an engine may look at them for an orchestrator, and what is told of them."""
+"""Files in containers, as far as an orchestrator is told of them."""
 
 from __future__ import annotations
 
 import asyncio
-import json
+import io
+import os
+import stat
+import tarfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from http import HTTPStatus
+from pathlib import PurePosixPath
+from typing import Any
 
 from skytether.api.service_report import MOST_BYTES
 
 from .archives import STAT, Images, is_odd, moved, pull_stat, push_stat, ways
 from .asking import JSON, TAR, Asking, RefusedCall
-from .names import loads_late
-from .removals import BusyError, begun
+from .engine_rules import FOLDER
 
-_MOST_FILE = MOST_BYTES + (8 << 10)
-"""Of the archive of one file, which is one of reports: the file, and some heads of 512 bytes."""
 _KNOWN = 4096
-"""Containers and images that are remembered."""
-_LOOK_THROUGH_S = 1.0
-"""That somebody who asks for a file waits for a look through its image, which goes on if it takes longer."""
-_AGAIN_S = 300.0
-"""Until an image is looked through again in which an engine hung: it holds up looks at others."""
+"""Containers that are remembered."""
+_TODO = "add CapabilityBoundingSet=CAP_DAC_READ_SEARCH to the node's unit (systemctl edit skytether-node)"
 
 
 class Files:
@@ -34,19 +35,17 @@ class Files:
     def __init__(self, engine: str, asking: Asking) -> None:
         self._asking = asking
         self._images = Images(engine)
-        self._opened: dict[str, str] = {}
-        """Containers into whose files the engine may look, and their images."""
-        self._looks: dict[str, asyncio.Task[str | None]] = {}
-        """By image that is looked through, or was."""
-        self._looking, self._looking_through = asyncio.Lock(), asyncio.Lock()
+        self._opened: set[str] = set()
+        """Containers into whose files the engine may look."""
+        self._looking = asyncio.Lock()
 
-    async def may_be_opened(self, container: str) -> str:
-        """Its image, empty if it is gone; raises unless the engine may look into its files."""
+    async def may_be_opened(self, container: str) -> None:
+        """Raises `RefusedCall` unless the engine may look into its files, or it is gone."""
         if container in self._opened:
-            return self._opened[container]
+            return
         status, found = await self._asking.asked(f"/containers/{container}/json")
         if status == HTTPStatus.NOT_FOUND:
-            return ""
+            return
         if status != HTTPStatus.OK or (refused := moved(found)):
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
         try:
@@ -56,58 +55,75 @@ class Files:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if odd:
             raise RefusedCall(f"its files are not looked at: {odd} is a link in its image, or no file, or a large one")
-        self._opened = self._opened if len(self._opened) < _KNOWN else {}
-        self._opened[container] = str(found["Image"])
-        return self._opened[container]
+        self._opened = self._opened if len(self._opened) < _KNOWN else set()
+        self._opened.add(container)
 
     async def stat(self, target: str) -> tuple[int, bytes, str]:
         """What is said of a file; of a link nothing: where it leads an engine finds out on the machine itself."""
         answer = await self._asking.ask(target, method="HEAD")
-        stat = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
-        if stat is None or is_odd(stat):
+        told = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
+        if told is None or is_odd(told):
             return HTTPStatus.NOT_FOUND, b"", JSON
-        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(stat)}"
+        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(told)}"
 
-    async def read(self, container: str, target: str) -> tuple[int, bytes, str]:
-        """An engine that waits until somebody takes the rest of a file lets nobody end its container."""
-        if image := await self.may_be_opened(container):
-            if late := await asyncio.to_thread(loads_late):
-                raise RefusedCall(f"its files are not read: {late}")
-            try:
-                if odd := await self._device(image):
-                    raise RefusedCall(f"its files are not read: in its image, {odd}")
-            except BusyError as error:
-                return HTTPStatus.SERVICE_UNAVAILABLE, json.dumps({"message": str(error)}).encode(), JSON
-            except (OSError, ValueError) as error:
-                why = f"its image is not looked through: {error}"
-                raise RefusedCall(why, HTTPStatus.SERVICE_UNAVAILABLE) from error
-        answer = await self._asking.ask(target, most=_MOST_FILE + 1)
-        if len(answer.content) > _MOST_FILE:
-            raise RefusedCall("the file is larger than those that a site asks for")
-        if answer.status != HTTPStatus.OK:  # in words that name files of the machine, perhaps
+    async def read(self, container: str, path: str) -> tuple[int, bytes, str]:
+        """A report, in an archive as an engine would make it.
+
+        By no engine: Docker's process for that has its root in the container, is root of the machine, and looks up the
+        names of owners there. It opens whatever a link leads to, and believes what answers and is loaded in there.
+        """
+        status, found = await self._asking.asked(f"/containers/{container}/json")
+        mounts = found.get("Mounts") or () if status == HTTPStatus.OK else ()
+        folder = next((str(one.get("Source")) for one in mounts if _is_the_volume(one)), None)
+        way = PurePosixPath(path).relative_to(FOLDER).parts
+        try:
+            content = None if folder is None else await asyncio.to_thread(read_beneath, folder, way, MOST_BYTES)
+        except PermissionError as error:
+            raise RefusedCall(f"its files are not read: {error}; {_TODO}") from error
+        if content is None:
             return HTTPStatus.NOT_FOUND, b'{"message": "it has no such file"}', JSON
-        return HTTPStatus.OK, answer.content, TAR
+        packed = io.BytesIO()
+        with tarfile.open(fileobj=packed, mode="w") as tar:
+            entry = tarfile.TarInfo(way[-1])
+            entry.size = len(content)
+            tar.addfile(entry, io.BytesIO(content))
+        return HTTPStatus.OK, packed.getvalue(), TAR
 
-    async def _device(self, image: str) -> str | None:
-        """As `Images.device`; raises `BusyError` while that is not known yet. It is found out once."""
-        busy = BusyError(f"image {image} is being looked through for files of devices: ask again")
-        if image not in self._looks:
-            if len(self._looks) >= _KNOWN:
-                self._looks = {one: task for one, task in self._looks.items() if not task.done()}
-            if len(self._looks) >= _KNOWN:
-                raise busy
-            self._looks[image] = begun(self._look_through(image))
-        task = self._looks[image]
-        await asyncio.wait((task,), timeout=_LOOK_THROUGH_S)
-        if not task.done():
-            raise busy
-        return task.result()
 
-    async def _look_through(self, image: str) -> str | None:
-        async with self._looking_through:
-            try:
-                return await asyncio.to_thread(self._images.device, image)
-            except (OSError, ValueError) as error:  # whoever asks again has it tried again
-                after_s = _AGAIN_S if isinstance(error, OSError) else 0.0
-                asyncio.get_running_loop().call_later(after_s, self._looks.pop, image, None)
-                raise
+def _is_the_volume(mount: Mapping[str, Any]) -> bool:
+    return (mount.get("Destination"), mount.get("Type"), mount.get("Driver")) == (FOLDER, "volume", "local")
+
+
+def read_beneath(folder: str, way: Sequence[str], most: int) -> bytes | None:
+    """What is in a file in a folder, on a way without links; None: there is no such file, or it is larger.
+
+    Whoever moves things there meanwhile has another file of that folder read, or none: each step begins at the folder
+    that was opened before. Nothing but a plain file is opened: the descriptor that is looked at reads nothing itself.
+
+    Args:
+        folder: Nobody else changes its own path.
+        way: Folders and the file, by names.
+        most: Bytes.
+
+    Raises:
+        PermissionError: This process may not.
+    """
+    with ExitStack() as opened:
+
+        def enter(name: str, flags: int, **at: int) -> int:
+            descriptor = os.open(name, flags | os.O_CLOEXEC, **at)
+            opened.callback(os.close, descriptor)
+            return descriptor
+
+        try:
+            here = enter(folder, os.O_PATH | os.O_DIRECTORY)
+            for name in way:
+                here = enter(name, os.O_PATH | os.O_NOFOLLOW, dir_fd=here)
+            if not stat.S_ISREG(os.fstat(here).st_mode):
+                return None
+            content = os.read(enter(f"/proc/self/fd/{here}", os.O_RDONLY | os.O_NONBLOCK), most + 1)
+        except PermissionError:
+            raise
+        except OSError:
+            return None
+    return content if len(content) <= most else None

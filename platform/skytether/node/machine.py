@@ -12,8 +12,7 @@ import platform
 import re
 import shutil
 import socket
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,20 +125,12 @@ def ask(
         OSError: It does not answer.
         ValueError: It answers something else.
     """
-    with answered(path, what, method=method, body=body, patience=patience) as answer:
-        return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
-
-
-@contextmanager
-def answered(
-    path: str, what: str, *, method: str = "GET", body: Any = None, patience: float = _ENGINE_S
-) -> Iterator[http.client.HTTPResponse]:
-    """One call whose answer is read by the caller, as it comes. Arguments and errors are those of `ask`."""
     connection = _Connection(path, patience)
     try:
         text = None if body is None else json.dumps(body)
         connection.request(method, what, text, {"Content-Type": "application/json"} if text else {})
-        yield connection.getresponse()
+        answer = connection.getresponse()
+        return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
     finally:

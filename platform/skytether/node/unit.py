@@ -24,13 +24,14 @@ After=network-online.target docker.service
 StartLimitIntervalSec=0
 
 [Service]
-# Root without any right: the engine's socket is root's, and whoever may use it is root anyway.
+# Root without any right but to read: the engine's socket is root's, and whoever may use it is root anyway; reports are
+# in volumes that belong to services.
 ExecStart={program} site run --folder {folder}
 Restart=always
 RestartSec=2
 UMask=0077
 NoNewPrivileges=yes
-CapabilityBoundingSet=
+CapabilityBoundingSet=CAP_DAC_READ_SEARCH
 ProtectSystem=strict
 ReadWritePaths={folder}
 ProtectHome={home}
