@@ -710,6 +710,16 @@ def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> 
     assert json.loads(got.partition(b"\r\n\r\n")[2]) == {"Volumes": [ours]}
 
 
+def test_no_container_is_made_of_which_an_engine_has_much_to_tell(engine: Engine) -> None:
+    """With 44 of an image with a megabyte of labels no list was read any more, and nothing made for anybody."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    created = request("POST /v1.41/containers/create", CREATED % b"skytether")
+    assert b"201 Created" in say(engine, created)
+    engine.container["Config"] = {"Labels": {"skytether.io/owner": "edge", "much": "a" * (64 << 10)}}
+    assert b"its description has more than 64 KiB" in say(engine, created)
+    assert engine.lines[-1] == f"DELETE /containers/{ID}?force=1&v=1"
+
+
 def test_of_many_labels_few_are_kept_in_memory() -> None:
     """With 32 MB of them, an answer took all the memory that the node's program may have."""
     labels = {"skytether.io/owner": "edge"} | {f"{i:x}": "" for i in range(20_000)}

@@ -12,6 +12,8 @@ import mmap
 import os
 import signal
 import struct
+import time
+from collections.abc import Callable
 from enum import IntEnum
 from math import isfinite, nan
 from typing import NamedTuple
@@ -27,6 +29,8 @@ _SLOT = 64
 _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")
 """``struct flock`` of the kernel."""
+_SPEAKS_S, _LOOKS = 0.004, 4
+"""For which somebody may tell the wheels something that does not stand still (it takes 0.1 ms), and looks meanwhile."""
 _PROCESSES = 1 << 32
 """More than there are."""
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
@@ -61,6 +65,36 @@ class Place(NamedTuple):
     """Descriptor of the board."""
     start: int
 
+    def end_speaker(self, sleep: Callable[[float], object] = time.sleep) -> int:
+        """End a process that stands still as it tells the wheels something.
+
+        It looked at the clock before. If it was frozen since then, it would go on with that, whatever the wheels were
+        told meanwhile; one that the kernel ends goes on with nothing. Who is done within `_SPEAKS_S` does not stand
+        still.
+
+        Returns:
+            Its number; 0: there is none, or it is not ours to end.
+        """
+        pid = self._speaker()
+        for _ in range(_LOOKS):
+            if not pid:
+                return 0
+            sleep(_SPEAKS_S / _LOOKS)
+            pid = pid if self._speaker() == pid else 0
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except OSError:
+            return 0
+        return pid
+
+    def _speaker(self) -> int:
+        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, self.start, _PROCESSES, 0)
+        try:
+            kind, _, _, _, pid = _LOCK.unpack(fcntl.fcntl(self.file, fcntl.F_GETLK, asked))
+        except OSError:
+            return 0
+        return 0 if kind == fcntl.F_UNLCK else max(0, int(pid))
+
 
 class Board:
     """The page. Each role has two places and writes to them in turn: one that dies while it writes spoils only one.
@@ -93,22 +127,6 @@ class Board:
     def place(self, role: Role) -> Place:
         """Where those of a role lock."""
         return Place(self._file, (1 + role) * _PROCESSES)
-
-    def end_speaker(self, role: Role) -> int:
-        """End a process that is telling the wheels something. Its number; 0: there is none, or it is not ours to end.
-
-        It looked at the clock before. If it was frozen since then, it would go on with that, whatever the wheels were
-        told meanwhile; one that the kernel ends goes on with nothing.
-        """
-        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, self.place(role).start, _PROCESSES, 0)
-        try:
-            kind, _, _, _, pid = _LOCK.unpack(fcntl.fcntl(self._file, fcntl.F_GETLK, asked))
-            if kind == fcntl.F_UNLCK or pid <= 0:
-                return 0
-            os.kill(pid, signal.SIGKILL)
-        except OSError:
-            return 0
-        return int(pid)
 
     def close(self) -> None:
         """Let go of the page."""

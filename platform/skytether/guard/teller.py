@@ -10,7 +10,7 @@ the other one has either seen that or cannot speak any more:
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
-  kernel is ended by who takes over (`board.Board.end_speaker`).
+  kernel is ended by who takes over (`board.Place.end_speaker`).
 
 Whoever turns the wheels may be held up, and read later what waits for it. Once no more can be sent to it, nobody knows
 whether they turn: it is told what goes on from the last velocity, or, when that was too long ago, nothing until it has
@@ -151,7 +151,7 @@ class Teller:
         other = _OTHER[self._role]
         spoke = self._board.of(other).told.at
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
-            pid = self._board.end_speaker(other)
+            pid = self._board.place(other).end_speaker()
             self.ended = _ENDED.format(pid) if pid else ""
         try:
             self._wheels.write(velocity)

@@ -76,6 +76,8 @@ _MOST_TOLD, _TOLD_S = 20, 600.0
 _MADE_S, _MOST_NETWORKS = 60.0, 12
 """For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
 take them all has addresses that the machine knows elsewhere."""
+_MOST_DESCRIBED = 64 << 10
+"""Bytes of what an engine says of one container."""
 _MAKES = ("/containers/create", "/volumes/create")
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
@@ -190,6 +192,8 @@ class EngineGate:
             return self._weigh(target)
         if path == MADE:
             return self._make(target, call.body)
+        if path == _MAKES[0]:
+            return self._create(target, call.body)
         if SEEN.fullmatch(path) and call.method == "GET":
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
@@ -295,6 +299,19 @@ class EngineGate:
             raise RefusedCall(str(error), HTTPStatus.SERVICE_UNAVAILABLE) from error
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+
+    async def _create(self, target: str, said: Any) -> tuple[int, bytes, str]:
+        """A container, if its description is not large: an engine tells all of it, with all others, in each list."""
+        answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
+        if answer.status == HTTPStatus.CREATED:
+            made = json.loads(answer.content)["Id"]
+            described = await self._ask(f"/containers/{made}/json", most=_MOST_DESCRIBED + 1)
+            if len(described.content) > _MOST_DESCRIBED:
+                await self._ask(f"/containers/{made}?force=1&v=1", method="DELETE", patience=_END_S)
+                raise RefusedCall(
+                    f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says"
+                )
+        return answer.status, answer.content, JSON
 
     async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
         """A network, unless there are many of ours."""

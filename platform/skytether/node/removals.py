@@ -21,7 +21,7 @@ from urllib.parse import urlencode
 
 from .engine_rules import OWNER
 from .kin import Kin
-from .machine import Answer, ask, ask_long, picked
+from .machine import Answer, ask, ask_long, lean, picked
 
 log = logging.getLogger(__name__)
 
@@ -168,11 +168,9 @@ class Removals:
         """
         await self.look_back()
         answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
-        found = json.loads(answer.content) if answer.status == HTTPStatus.OK else {}
-        if container in self._mine or (found.get("State") or {}).get("Status") != "created":
-            return None
-        names = [str(one.get("Name")) for one in found.get("Mounts") or () if one.get("Destination") == own]
-        if own and not (names and all(map(_OWN.fullmatch, names))):
+        takes = answer.status == HTTPStatus.OK and _takes_files(answer.content, own)
+        del answer  # it may be large, and the engine may take any time
+        if container in self._mine or not takes:
             return None
         self._puts.add(container)
         task = begun(ask_long(self._engine, path, method="PUT", archive=archive))
@@ -191,7 +189,8 @@ class Removals:
         answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
         if answer.status != HTTPStatus.OK:
             return answer  # it is gone, or nobody knows its volumes
-        things = (container, *_volumes(json.loads(answer.content)))
+        things = (container, *_volumes(lean(answer.content)))
+        del answer  # it may be large, and the engine may take any time
         removed = await self._removed(things, path, itself=container)
         return removed or await ask_long(self._engine, without, method="DELETE")
 
@@ -350,6 +349,14 @@ def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
     task = asyncio.create_task(work)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
     return task
+
+
+def _takes_files(content: bytes, own: str) -> bool:
+    """Whether a container was never started, and has a volume that it alone has at a path; empty: at none."""
+    found = picked(content, "State", "Status", "Mounts", "Destination", "Name")
+    names = [str(one.get("Name")) for one in found.get("Mounts") or () if one.get("Destination") == own]
+    alone = bool(names) and all(map(_OWN.fullmatch, names))
+    return (found.get("State") or {}).get("Status") == "created" and (alone or not own)
 
 
 def _volumes(inspected: Mapping[str, Any]) -> tuple[str, ...]:

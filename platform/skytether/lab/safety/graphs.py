@@ -37,13 +37,16 @@ def with_a_writer(add: Callable[[str, str, deaths.Run, float], None]) -> None:
     add("laser-silent", "the laser falls silent", hardware.blind("nothing any more", lambda _: lambda: None), 4)
 
 
-def frozen_in_the_midst(role: str, what: str, victims: Callable[[Stage], list[int]]) -> tuple[str, str, deaths.Run]:
+def frozen_in_the_midst(
+    role: str, what: str, victims: Callable[[Stage], list[int]], dies: str = ""
+) -> tuple[str, str, deaths.Run]:
     """An attack: one who publishes velocities is frozen between its last look at the clock and the kernel.
 
     Args:
         role: Names it.
         what: Who that is, in words.
         victims: Its process.
+        dies: Role of another one that is killed meanwhile; empty: none is.
     """
 
     def run(stage: Stage) -> None:
@@ -57,11 +60,17 @@ def frozen_in_the_midst(role: str, what: str, victims: Callable[[Stage], list[in
         else:
             stage.wrong("stuck", f"in {_TRIES} tries {what} was never found as it published")
             return
+        if dies:
+            stage.robot.signal(dies, signal.SIGKILL)
         stage.sleep(_STAND_S)
         stage.robot.kill(victim, signal.SIGCONT)
+        if dies:
+            stage.sleep(1.0)
+            stage.robot.start()
         stage.drives_on(f"the robot drives on after {what} was frozen as it published")
 
-    return f"{role}-frozen-in-the-midst", f"{what} is frozen as it publishes a velocity, and goes on", run
+    name, also = f"{role}-frozen-in-the-midst", f"; meanwhile the {dies} is killed" if dies else ""
+    return f"{name}-{dies}" if dies else name, f"{what} is frozen as it publishes a velocity, and goes on{also}", run
 
 
 def _speaks(pid: int) -> bool:

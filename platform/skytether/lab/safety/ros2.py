@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,9 @@ def enter(attacks: Attacks) -> None:
         for seconds in _FREEZES_S:
             what = f"{words} is frozen for {seconds:g} s, and goes on"
             add(f"{role}-program-frozen-{seconds:g}", what, _frozen(role, seconds), seconds + 2)
-    add(*frozen_in_the_midst("writer-program", "the writer's program", lambda stage: _programs(stage, "writer")), 6)
+    for dies in ("", "gate", "writer"):
+        frozen = frozen_in_the_midst("writer-program", "the writer's program", partial(_programs, role="writer"), dies)
+        add(*frozen, 8)
     add("program-frozen-stop", "a stop while the writer's program is frozen", _frozen_and("stop"), 4)
     add("program-frozen-agent", "the agent is killed while the writer's program is frozen", _frozen_and("agent"), 4)
     add("program-frozen-writer", "the writer is killed while its program is frozen", _frozen_and("writer"), 6)

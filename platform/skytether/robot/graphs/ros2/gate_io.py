@@ -49,7 +49,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
     def __init__(
         self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "", place: Place | None = None
     ) -> None:
-        self._way = way
+        self._way, self._place = way, place
         super().__init__(_start(way, role, place))
         self._clock = GraphClock(self._node)
         self._topic = resolve(way.cmd_vel, way.namespace)
@@ -90,6 +90,8 @@ class Ros2Wheels(RosWheels[GraphNode]):
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, none while they cannot be told anything."""
+        if self._publication.stuck and self._place is not None:  # who would take over may be dead
+            self._place.end_speaker()
         if self._publication.stuck or self._publication.refused:
             return frozenset()
         lives = self._node.lives(self._topic, Kind.SUBSCRIPTION)
