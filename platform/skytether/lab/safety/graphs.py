@@ -65,8 +65,7 @@ def frozen_in_the_midst(
         stage.sleep(_STAND_S)
         stage.robot.kill(victim, signal.SIGCONT)
         if dies:
-            stage.sleep(1.0)
-            stage.robot.start()
+            stage.robot.go()
         stage.drives_on(f"the robot drives on after {what} was frozen as it published")
 
     name, also = f"{role}-frozen-in-the-midst", f"; meanwhile the {dies} is killed" if dies else ""

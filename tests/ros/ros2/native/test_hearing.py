@@ -66,6 +66,15 @@ def test_who_comes_without_a_name_yet_stops_nobody_where_all_who_were_there_ackn
     assert publisher.publish("be", True).heard
 
 
+def test_the_wheels_whose_name_was_not_known_as_they_came_are_known_as_they_go(publisher):
+    for there in ("r", "r ", "rb", "r"):
+        publisher.publish(there, True, 5)
+    assert not publisher.publish("rb", True).heard
+    for there in ("rb", "rb ", "rb"):
+        publisher.publish(there, True, 5)
+    assert not publisher.publish("rbx", True).heard, "nobody knew who that was"
+
+
 @pytest.mark.parametrize(("there", "read"), [("b", False), ("B", True), ("rB", True)])
 def test_who_comes_without_a_name_yet_may_be_one_who_was_killed_and_is_shown_still(publisher, there, read):
     publisher.publish(there, True, 5)

@@ -15,7 +15,12 @@ class Comers:
     def __init__(self) -> None:
         self._here: Counter[str] = Counter()
         self._away: dict[str, None] = {}
-        """Who left and has not come back, the one who left first at first."""
+        """Who left and has not come back, the one who left first at first; empty: somebody whose name nobody knew."""
+
+    @property
+    def unnamed(self) -> bool:
+        """Whether somebody is there whose name is not known yet."""
+        return "" in self._here
 
     def is_anybody_back(self, names: Collection[str], *, all_live: bool = False) -> bool:
         """Whether somebody came who may have been there before.
@@ -29,10 +34,14 @@ class Comers:
         """
         here = Counter(names)
         came, gone = here - self._here, self._here - here
-        known = [name for name in gone if name]
-        self._away |= dict.fromkeys(known)
-        back = bool(came) and (bool(self._away) or any(name in self._here or not (name or all_live) for name in came))
-        for name in came:
+        unnamed = gone.pop("", 0)
+        named = min(unnamed, came.total() - came[""])  # of those who were there, by now
+        if unnamed > named:
+            gone[""] = unnamed - named
+        self._away |= dict.fromkeys(gone)
+        new = came.total() > named
+        back = (new and bool(self._away)) or any(name in self._here if name else not all_live for name in came)
+        for name in (*came, *([""] if new else [])):
             self._away.pop(name, None)
         while len(self._away) > MOST:
             del self._away[next(iter(self._away))]

@@ -46,10 +46,11 @@ class Hearing:
         """
         before, self._listeners = self._listeners, listeners
         all_read, self._read = self._read, read  # before: of who comes now it is not known
-        back = listeners != before and self._is_anybody_back(nodes(), all_read=all_read)
+        looks = listeners != before or self._comers.unnamed
+        back = looks and self._is_anybody_back(nodes(), all_read=all_read)
         if not listeners:
             self.heard, self._told_since = False, None
-        elif listeners > before and (back or self.unread_s > SILENT_S):
+        elif back or (listeners > before and self.unread_s > SILENT_S):
             # The wheels' node may have been started again, beside somebody else.
             self.heard, self._told_since = False, now
         elif listeners >= before and self._told_since is not None and (read or now - self._told_since > HEARS_S):
