@@ -29,8 +29,9 @@ _SLOT = 64
 _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")
 """``struct flock`` of the kernel."""
-_SPEAKS_S, _LOOKS = 0.004, 4
-"""For which somebody may tell the wheels something that does not stand still (it takes 0.1 ms), and looks meanwhile."""
+_SPEAKS_S, _LOOKS = 0.008, 8
+"""For which somebody may tell the wheels something who does not stand still, and looks meanwhile: it takes 0.1 ms, and
+some while others come to DDS or go."""
 _PROCESSES = 1 << 32
 """More than there are."""
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW

@@ -59,9 +59,10 @@ def cleaned(archive: bytes, where: str) -> bytes | None:
 
     ``where``: the folder that it is put in.
 
-    Its heads are read one by one: what says of the next one how it is to be read is something else.
+    Its heads are read one by one: what says of the next one how it is to be read is something else. The grant's folder
+    comes before it: an image may have put a link there, which becomes a folder so.
     """
-    buffer, place = io.BytesIO(), 0
+    buffer, place, folders = io.BytesIO(), 0, set[str]()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
         for _ in range(_MOST_ENTRIES):
             head = archive[place : place + _BLOCK]
@@ -72,7 +73,8 @@ def cleaned(archive: bytes, where: str) -> bytes | None:
             except (tarfile.TarError, ValueError):
                 return None
             made, content = tarfile.TarInfo(entry.name), b""
-            if entry.type == tarfile.REGTYPE and (where, entry.name) == (FOLDER, _GRANT) and entry.size >= 0:
+            known = posixpath.dirname(entry.name) in folders
+            if entry.type == tarfile.REGTYPE and (where, entry.name) == (FOLDER, _GRANT) and known and entry.size >= 0:
                 content = archive[place + _BLOCK : place + _BLOCK + entry.size]
             elif entry.type != tarfile.DIRTYPE or not _FOLDERS[where].fullmatch(entry.name):
                 return None
@@ -81,6 +83,7 @@ def cleaned(archive: bytes, where: str) -> bytes | None:
             made.type, made.mode, made.uid, made.gid = entry.type, entry.mode & 0o777, entry.uid, entry.gid
             made.size = len(content)
             tar.addfile(made, io.BytesIO(content))
+            folders |= {entry.name} - {_GRANT}
             place += _BLOCK + -(-len(content) // _BLOCK) * _BLOCK
     return None
 

@@ -16,7 +16,10 @@ from skytether.ros.ros2.native.side.comers import MOST, Comers
         ([["/base"], ["/base", ""], ["/base", "/echo"]], [1]),  # and now it is
         ([["/base", "/base"], ["/base"], ["/base", "/base"]], [2]),  # a subscription made anew
         ([["/echo"], ["/echo", ""], ["/echo"], ["/echo", "/base"], ["/echo", "/base", "/new"]], [1, 3]),  # nobody knew
-        ([["/base", "/echo", ""], ["/base", "/new"], ["/base", "/new", "/other"]], [0, 2]),  # one goes, one has a name now
+        (
+            [["/base", "/echo", ""], ["/base", "/new"], ["/base", "/new", "/other"]],
+            [0, 2],
+        ),  # one goes, one has a name now
         ([["/base"], ["/base", ""], ["/base", "/base"]], [1, 2]),
     ],
 )
