@@ -13,7 +13,6 @@ import os
 import signal
 import struct
 import time
-from collections.abc import Callable
 from enum import IntEnum
 from math import isfinite, nan
 from typing import NamedTuple
@@ -29,9 +28,7 @@ _SLOT = 64
 _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")
 """``struct flock`` of the kernel."""
-_SPEAKS_S, _LOOKS = 0.008, 8
-"""For which somebody may tell the wheels something who does not stand still, and looks meanwhile: it takes 0.1 ms, and
-some while others come to DDS or go."""
+_LOOKS = 8
 _PROCESSES = 1 << 32
 """More than there are."""
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
@@ -66,12 +63,15 @@ class Place(NamedTuple):
     """Descriptor of the board."""
     start: int
 
-    def end_speaker(self, sleep: Callable[[float], object] = time.sleep) -> int:
+    def end_speaker(self, patience_s: float) -> int:
         """End a process that stands still as it tells the wheels something.
 
         It looked at the clock before. If it was frozen since then, it would go on with that, whatever the wheels were
-        told meanwhile; one that the kernel ends goes on with nothing. Who is done within `_SPEAKS_S` does not stand
-        still.
+        told meanwhile; one that the kernel ends goes on with nothing.
+
+        Args:
+            patience_s: Who is done in that time does not stand still: it takes 0.1 ms, and some while others come to
+                DDS or go [s].
 
         Returns:
             Its number; 0: there is none, or it is not ours to end.
@@ -80,7 +80,7 @@ class Place(NamedTuple):
         for _ in range(_LOOKS):
             if not pid:
                 return 0
-            sleep(_SPEAKS_S / _LOOKS)
+            time.sleep(patience_s / _LOOKS)
             pid = pid if self._speaker() == pid else 0
         try:
             os.kill(pid, signal.SIGKILL)

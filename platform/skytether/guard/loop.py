@@ -28,7 +28,7 @@ from .record import Record
 from .requests import Reply, Requests
 from .settings import Settings
 from .systemd import Systemd
-from .teller import Teller, repeat_s
+from .teller import SPEAKS, Teller, repeat_s
 from .velocity import STANDSTILL
 from .watch import Watch
 from .wheels import SocketWheels, WriterWheels
@@ -321,7 +321,9 @@ class Guard:
             self._watch.forget()
         child.end()
         role = Role.SECOND if name == "gate" else Role.FIRST
-        if pid := self._board.place(role).end_speaker():  # a program that it had, which may go on
+        if pid := self._board.place(role).end_speaker(
+            SPEAKS * self._settings.period_s
+        ):  # a program that it had, which may go on
             self._log.line("ERROR", f"process {pid} of the {name} stood still as it told the wheels something: ended")
         self._dead.append(child)
         if name == "gate":

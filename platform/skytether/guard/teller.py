@@ -37,6 +37,8 @@ SILENT = 1.5
 """Periods. The gate speaks in every period, and the first answers it by telling the wheels."""
 LATE = 0.75
 """Periods."""
+SPEAKS = 0.4
+"""Periods. Who says something for longer stands still; less than `LATE`."""
 _SOON = 0.5
 """Periods. So much later than the second's claim the first may still speak without a claim of its own."""
 _UNREAD = "their driver does not read what it is sent"
@@ -145,14 +147,14 @@ class Teller:
             return False
         self.unread = self._wheels.unread()
         velocity, _ = self._watch.want(now, stopped or bool(self.unread))
-        at = self._clock()
-        if at - now > LATE * self._period_s or not self._may(at):
-            return False
         other = _OTHER[self._role]
         spoke = self._board.of(other).told.at
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
-            pid = self._board.place(other).end_speaker()
+            pid = self._board.place(other).end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
+        at = self._clock()
+        if at - now > LATE * self._period_s or not self._may(at):
+            return False
         try:
             self._wheels.write(velocity)
         except BlockingIOError:

@@ -56,6 +56,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
+        self._speaks_s = timing.fresh_s / 4
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         publish = partial(self._node.publish, fresh_s=timing.fresh_s, stuck_s=timing.stuck_s)
         self._publication = publish(endpoint, farewell=farewell, farewell_after_s=timing.brakes_s)
@@ -91,7 +92,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, none while they cannot be told anything."""
         if self._publication.stuck and self._place is not None:  # who would take over may be dead
-            self._place.end_speaker()
+            self._place.end_speaker(self._speaks_s)
         if self._publication.stuck or self._publication.refused:
             return frozenset()
         lives = self._node.lives(self._topic, Kind.SUBSCRIPTION)
