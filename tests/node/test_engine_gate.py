@@ -550,6 +550,13 @@ def volume(path: str, name: str = ID) -> dict[str, str]:
     return {"Type": "volume", "Name": name, "Destination": path}
 
 
+def starts(engine: Engine) -> bytes:
+    """A start of the container, in a network of ours: an engine mounts its volumes then."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    engine.container["HostConfig"] = {"NetworkMode": "skytether", **(engine.container["HostConfig"] or {})}
+    return request(f"POST /containers/{ID}/start")
+
+
 @pytest.mark.parametrize(
     ("mounts", "changes", "links", "says"),
     [
@@ -586,7 +593,7 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     engine: Engine, mounts: list[Any], changes: dict[str, Any], links: set[str], says: bytes
 ) -> None:
     engine.container, engine.links = {"HostConfig": {"ReadonlyRootfs": True}, "Mounts": mounts, **changes}, links
-    sent = request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    sent = starts(engine)
     got = say(engine, sent + sent)
     if not says:
         assert got.count(b"200 OK") == 2
@@ -601,7 +608,7 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
 def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Engine) -> None:
     """Where nothing is any more no link is found."""
     engine.emptied = True
-    sent = request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json")
+    sent = starts(engine)
     assert b"was removed meanwhile" in say(engine, sent)
     engine.emptied = False
     assert b"200 OK" in say(engine, sent)
@@ -609,33 +616,20 @@ def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Eng
 
 def test_no_orchestrator_starts_what_the_node_made_to_look_at_an_image(engine: Engine) -> None:
     """That image may say of itself whose it is, and have volumes that make the look a false one."""
-    say(engine, request(f"HEAD /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Fready.json"))
+    say(engine, starts(engine))
     (made,) = [json.loads(body) for line, _, body in engine.asked if line.startswith("POST /containers/create")]
     engine.container = {"Config": {"Labels": {"skytether.io/owner": "edge", **made["Labels"]}}}
     assert b"is not of an orchestrator" in say(engine, request(f"POST /containers/{ID}/start"))
 
 
-def test_of_a_link_nobody_hears_where_it_leads(engine: Engine) -> None:
-    """An engine finds that out on the machine itself, where a link may lead by then."""
-    reports = "/run/skytether/instance/reports.json"
-    asks = request(f"HEAD /v1.41/containers/{ID}/archive?path={quote(reports, safe='')}")
-    got = say(engine, asks)
-    assert b"200 OK" in got
-    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
-    assert stat == {
-        "name": "reports.json",
-        "size": 1000,
-        "mode": 0o644,
-        "mtime": "2026-11-27T12:00:00Z",
-        "linkTarget": "",
-    }
-    engine.links = {reports}
-    got = say(engine, asks)
-    assert b"404 Not Found" in got
-    assert b"Path-Stat" not in got
-
-
 REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Freports.json"
+
+
+STATS = request(REPORT.replace("GET", "HEAD", 1))
+
+
+def refuse(*_: Any) -> None:
+    raise PermissionError(13, "Permission denied", "reports.json")
 
 
 @pytest.fixture
@@ -686,6 +680,25 @@ def test_of_what_is_no_report_nothing_is_read(engine: Engine, reports: Path, how
     got = say(engine, request(REPORT))
     assert b"404 Not Found" in got
     assert b"secret" not in got
+    if how != "large":
+        assert b"404 Not Found" in say(engine, STATS)
+
+
+def test_of_a_report_size_and_time_are_told_by_the_node_itself(engine: Engine, reports: Path) -> None:
+    reports.write_bytes(b"[1, 2]")
+    reports.chmod(0o640)
+    os.utime(reports, ns=(0, 1_764_000_000_012_345_678))
+    got = say(engine, STATS)
+    assert b"200 OK" in got
+    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
+    assert stat == {
+        "name": "reports.json",
+        "size": 6,
+        "mode": 0o640,
+        "mtime": "2025-11-24T16:00:00.012345678Z",
+        "linkTarget": "",
+    }
+    assert not any("/archive" in line or line.startswith("POST") for line in engine.lines)
 
 
 @pytest.mark.parametrize(
@@ -697,11 +710,29 @@ def test_only_a_volume_of_this_machine_has_reports(engine: Engine, reports: Path
     assert b"404 Not Found" in say(engine, request(REPORT))
 
 
-def test_a_node_that_may_not_read_reports_says_so(engine: Engine, reports: Path, monkeypatch: Any) -> None:
-    def refuse(*_: Any) -> None:
-        raise PermissionError(13, "Permission denied", str(reports))
+def test_of_a_link_nobody_hears_where_it_leads_by_a_node_that_may_not_read(
+    engine: Engine, reports: Path, monkeypatch: Any
+) -> None:
+    """An engine finds that out on the machine itself, where a link may lead by then."""
+    monkeypatch.setattr("skytether.node.files.beneath", refuse)
+    got = say(engine, STATS)
+    assert b"200 OK" in got
+    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
+    assert stat == {
+        "name": "reports.json",
+        "size": 1000,
+        "mode": 0o644,
+        "mtime": "2026-11-27T12:00:00Z",
+        "linkTarget": "",
+    }
+    engine.links = {parse_qs(urlsplit(REPORT).query)["path"][0]}
+    got = say(engine, STATS)
+    assert b"404 Not Found" in got
+    assert b"Path-Stat" not in got
 
-    monkeypatch.setattr("skytether.node.files.read_beneath", refuse)
+
+def test_a_node_that_may_not_read_reports_says_so(engine: Engine, reports: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("skytether.node.files.beneath", refuse)
     assert b"add CapabilityBoundingSet=CAP_DAC_READ_SEARCH to the node's unit" in say(engine, request(REPORT))
 
 

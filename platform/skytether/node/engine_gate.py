@@ -199,7 +199,7 @@ class EngineGate:
         if path.endswith("/archive") and call.method == "GET":
             return self._files.read(name, call.query["path"])
         if path.endswith("/archive") and call.method == "HEAD":
-            return self._files.stat(target)
+            return self._files.stat(name, call.query["path"], target)
         if path.endswith("/archive") and call.method == "PUT":
             return self._put(name, target, archive, call.query["path"])
         if kind == "containers" and path.endswith("/start"):
@@ -231,7 +231,7 @@ class EngineGate:
                 await self._may_be_guarded(subject[1])
             elif not await self._is_ours(subject):
                 raise RefusedCall(f"{subject[1][:80]} is not of an orchestrator")
-        if call.path.endswith("/archive") and call.method != "GET":
+        if call.path.endswith("/archive") and call.method == "PUT":
             await self._files.may_be_opened(subjects[0][1])
         elif plain(call.path) in _MAKES:
             await self._tried(self._removals.look_back())

@@ -7,11 +7,12 @@ import io
 import os
 import stat
 import tarfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from datetime import UTC, datetime
 from http import HTTPStatus
 from pathlib import PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 
 from skytether.api.service_report import MOST_BYTES
 
@@ -19,6 +20,7 @@ from .archives import STAT, Images, is_odd, moved, pull_stat, push_stat, ways
 from .asking import JSON, TAR, Asking, RefusedCall
 from .engine_rules import FOLDER
 
+_T = TypeVar("_T")
 _KNOWN = 4096
 """Containers that are remembered."""
 _TODO = "add CapabilityBoundingSet=CAP_DAC_READ_SEARCH to the node's unit (systemctl edit skytether-node)"
@@ -58,13 +60,24 @@ class Files:
         self._opened = self._opened if len(self._opened) < _KNOWN else set()
         self._opened.add(container)
 
-    async def stat(self, target: str) -> tuple[int, bytes, str]:
-        """What is said of a file; of a link nothing: where it leads an engine finds out on the machine itself."""
-        answer = await self._asking.ask(target, method="HEAD")
-        told = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
+    async def stat(self, container: str, path: str, target: str) -> tuple[int, bytes, str]:
+        """What is said of a file; of anything else nothing.
+
+        Args:
+            container: Its id.
+            path: Of the file.
+            target: What an engine is asked, by a program that may not read: where a link leads it finds out on the
+                machine itself, and mounts the container's volumes for that.
+        """
+        try:
+            told = await self._beneath(container, path, _stat_of)
+        except PermissionError:
+            await self.may_be_opened(container)
+            answer = await self._asking.ask(target, method="HEAD")
+            told = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
         if told is None or is_odd(told):
             return HTTPStatus.NOT_FOUND, b"", JSON
-        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(told)}"
+        return HTTPStatus.OK, b"", f"{STAT}: {push_stat({**told, 'name': PurePosixPath(path).name})}"
 
     async def read(self, container: str, path: str) -> tuple[int, bytes, str]:
         """A report, in an archive as an engine would make it.
@@ -72,58 +85,75 @@ class Files:
         By no engine: Docker's process for that has its root in the container, is root of the machine, and looks up the
         names of owners there. It opens whatever a link leads to, and believes what answers and is loaded in there.
         """
-        status, found = await self._asking.asked(f"/containers/{container}/json")
-        mounts = found.get("Mounts") or () if status == HTTPStatus.OK else ()
-        folder = next((str(one.get("Source")) for one in mounts if _is_the_volume(one)), None)
-        way = PurePosixPath(path).relative_to(FOLDER).parts
         try:
-            content = None if folder is None else await asyncio.to_thread(read_beneath, folder, way, MOST_BYTES)
+            content = await self._beneath(container, path, _content_of)
         except PermissionError as error:
             raise RefusedCall(f"its files are not read: {error}; {_TODO}") from error
         if content is None:
             return HTTPStatus.NOT_FOUND, b'{"message": "it has no such file"}', JSON
         packed = io.BytesIO()
         with tarfile.open(fileobj=packed, mode="w") as tar:
-            entry = tarfile.TarInfo(way[-1])
+            entry = tarfile.TarInfo(PurePosixPath(path).name)
             entry.size = len(content)
             tar.addfile(entry, io.BytesIO(content))
         return HTTPStatus.OK, packed.getvalue(), TAR
+
+    async def _beneath(self, container: str, path: str, take: Callable[[int], _T]) -> _T | None:
+        """What is made of a file in the volume at `FOLDER`; see `beneath`."""
+        status, found = await self._asking.asked(f"/containers/{container}/json")
+        mounts = found.get("Mounts") or () if status == HTTPStatus.OK else ()
+        folder = next((str(one.get("Source")) for one in mounts if _is_the_volume(one)), None)
+        if folder is None:
+            return None
+        return await asyncio.to_thread(beneath, folder, PurePosixPath(path).relative_to(FOLDER).parts, take)
 
 
 def _is_the_volume(mount: Mapping[str, Any]) -> bool:
     return (mount.get("Destination"), mount.get("Type"), mount.get("Driver")) == (FOLDER, "volume", "local")
 
 
-def read_beneath(folder: str, way: Sequence[str], most: int) -> bytes | None:
-    """What is in a file in a folder, on a way without links; None: there is no such file, or it is larger.
+def beneath(folder: str, way: Sequence[str], take: Callable[[int], _T]) -> _T | None:
+    """What is made of a plain file in a folder, on a way without links; None: there is no such file.
 
-    Whoever moves things there meanwhile has another file of that folder read, or none: each step begins at the folder
-    that was opened before. Nothing but a plain file is opened: the descriptor that is looked at reads nothing itself.
+    Whoever moves things there meanwhile has another file of that folder taken, or none: each step begins at the folder
+    that was opened before. What is no plain file is never opened: such a descriptor reads nothing itself.
 
     Args:
         folder: Nobody else changes its own path.
         way: Folders and the file, by names.
-        most: Bytes.
+        take: Gets a descriptor of the file, which reads nothing itself.
 
     Raises:
         PermissionError: This process may not.
     """
     with ExitStack() as opened:
-
-        def enter(name: str, flags: int, **at: int) -> int:
-            descriptor = os.open(name, flags | os.O_CLOEXEC, **at)
-            opened.callback(os.close, descriptor)
-            return descriptor
-
         try:
-            here = enter(folder, os.O_PATH | os.O_DIRECTORY)
+            here = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+            opened.callback(os.close, here)
             for name in way:
-                here = enter(name, os.O_PATH | os.O_NOFOLLOW, dir_fd=here)
-            if not stat.S_ISREG(os.fstat(here).st_mode):
-                return None
-            content = os.read(enter(f"/proc/self/fd/{here}", os.O_RDONLY | os.O_NONBLOCK), most + 1)
+                here = os.open(name, os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=here)
+                opened.callback(os.close, here)
+            return take(here) if stat.S_ISREG(os.fstat(here).st_mode) else None
         except PermissionError:
             raise
         except OSError:
             return None
-    return content if len(content) <= most else None
+
+
+def _content_of(file: int) -> bytes | None:
+    """None: it is larger than reports are."""
+    with open(f"/proc/self/fd/{file}", "rb", buffering=0, opener=_without_waiting) as opened:
+        content = opened.read(MOST_BYTES + 1)
+    return content if len(content) <= MOST_BYTES else None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK)  # for whoever has a lease on it to let go
+
+
+def _stat_of(file: int) -> dict[str, Any]:
+    """As an engine says it."""
+    found = os.fstat(file)
+    seconds, rest = divmod(found.st_mtime_ns, 10**9)
+    when = datetime.fromtimestamp(seconds, UTC)
+    return {"size": found.st_size, "mode": found.st_mode & 0o777, "mtime": f"{when:%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"}
