@@ -149,14 +149,15 @@ def gets_nothing_by_a_way_around(client: Engine, good: dict[str, Any], docker_si
     imported = subprocess.run(["docker", "import", "-"], input=tar.getvalue(), capture_output=True, check=True)
     linked = imported.stdout.decode().strip()
     try:
-        for of, inner, says in ((image, "/outer/a/b", False), (linked, "/alias/a/b", False), (linked, "/b", True)):
+        for of, inner, good_way in ((image, "/outer/a/b", False), (linked, "/alias/a/b", False), (linked, "/b", True)):
             mounts = [{"Type": "volume", "Target": path} for path in ("/outer", inner)]
             body = {**good, "Image": of, "HostConfig": {**good["HostConfig"], "Mounts": mounts}}
             made = client.create_container_from_config(body)["Id"]
             try:
                 status, _ = asked("HEAD", f"/v1.41/containers/{made}/archive?path={quote(READY)}")
-                assert status == (HTTPStatus.NOT_FOUND if says else HTTPStatus.FORBIDDEN), inner
+                assert status == HTTPStatus.NOT_FOUND, inner
+                assert refused("POST", f"/v1.41/containers/{made}/start") is not good_way, inner
             finally:
-                client.remove_container(made, v=True)
+                client.remove_container(made, v=True, force=True)
     finally:
         docker_site.docker("rmi", "-f", linked)

@@ -78,9 +78,15 @@ def test_the_wheels_whose_name_was_not_known_as_they_came_are_known_as_they_go(p
 @pytest.mark.parametrize(("there", "read"), [("b", False), ("B", True), ("rB", True)])
 def test_who_comes_without_a_name_yet_may_be_one_who_was_killed_and_is_shown_still(publisher, there, read):
     publisher.publish(there, True, 5)
-    publisher.publish(there, read, 2)
+    publisher.publish(there, read, 13)
     assert publisher.hearing.heard
     assert not publisher.publish(f"{there} ", read).heard
+
+
+def test_who_comes_without_a_name_yet_stops_nobody_where_one_acknowledges_a_little_late(publisher):
+    publisher.publish("b", True, 5)
+    publisher.publish("b", False, 8)
+    assert publisher.publish("b ", False).heard
 
 
 def test_who_comes_while_nobody_is_heard_is_to_hear_a_first_word(publisher):

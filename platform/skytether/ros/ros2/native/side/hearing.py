@@ -8,6 +8,8 @@ from .comers import Comers
 
 Listener = tuple[str, bool]
 """Name of the node, empty where it is not known, and whether it acknowledges what it hears."""
+LIVE_S = 0.25
+"""Within which somebody has acknowledged something who was not killed and started again meanwhile."""
 SILENT_S = 0.5
 """Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 HEARS_S = 3.0
@@ -45,9 +47,11 @@ class Hearing:
             nodes: Gives those of them; asked where they are others.
         """
         before, self._listeners = self._listeners, listeners
-        all_read, self._read = self._read, read  # before: of who comes now it is not known
+        # Before: of who comes now it is not known.
+        live = self._read or (self._read_at is not None and now - self._read_at <= LIVE_S)
+        self._read = read
         looks = listeners != before or self._comers.unnamed
-        back = looks and self._is_anybody_back(nodes(), all_read=all_read)
+        back = looks and self._is_anybody_back(nodes(), live=live)
         if not listeners:
             self.heard, self._told_since = False, None
         elif back or (listeners > before and self.unread_s > SILENT_S):
@@ -59,8 +63,8 @@ class Hearing:
             self._read_at = now if listeners else None
         self.unread_s = 0.0 if self._read_at is None else now - self._read_at
 
-    def _is_anybody_back(self, nodes: Collection[Listener], *, all_read: bool) -> bool:
-        all_live = all_read and all(acknowledges for name, acknowledges in nodes if name)
+    def _is_anybody_back(self, nodes: Collection[Listener], *, live: bool) -> bool:
+        all_live = live and all(acknowledges for name, acknowledges in nodes if name)
         return self._comers.is_anybody_back([name for name, _ in nodes], all_live=all_live)
 
     def tell(self, listeners: int, now: float) -> None:
