@@ -628,6 +628,11 @@ REPORT = f"GET /containers/{ID}/archive?path=%2Frun%2Fskytether%2Finstance%2Frep
 STATS = request(REPORT.replace("GET", "HEAD", 1))
 
 
+def stat_in(answer: bytes) -> Any:
+    """What is told of a file."""
+    return json.loads(base64.b64decode(answer.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
+
+
 def refuse(*_: Any) -> None:
     raise PermissionError(13, "Permission denied", "reports.json")
 
@@ -690,8 +695,7 @@ def test_of_a_report_size_and_time_are_told_by_the_node_itself(engine: Engine, r
     os.utime(reports, ns=(0, 1_764_000_000_012_345_678))
     got = say(engine, STATS)
     assert b"200 OK" in got
-    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
-    assert stat == {
+    assert stat_in(got) == {
         "name": "reports.json",
         "size": 6,
         "mode": 0o640,
@@ -717,8 +721,7 @@ def test_of_a_link_nobody_hears_where_it_leads_by_a_node_that_may_not_read(
     monkeypatch.setattr("skytether.node.files.beneath", refuse)
     got = say(engine, STATS)
     assert b"200 OK" in got
-    stat = json.loads(base64.b64decode(got.partition(b"Path-Stat: ")[2].split(b"\r\n")[0]))
-    assert stat == {
+    assert stat_in(got) == {
         "name": "reports.json",
         "size": 1000,
         "mode": 0o644,

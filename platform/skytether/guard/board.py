@@ -29,6 +29,7 @@ _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")
 """``struct flock`` of the kernel."""
 _LOOKS = 8
+"""At somebody who may stand still."""
 _PROCESSES = 1 << 32
 """More than there are."""
 _SEALS = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW

@@ -320,10 +320,8 @@ class Guard:
             self._receive(_LAST_PACKETS)  # its last word may be a stop
             self._watch.forget()
         child.end()
-        role = Role.SECOND if name == "gate" else Role.FIRST
-        if pid := self._board.place(role).end_speaker(
-            SPEAKS * self._settings.period_s
-        ):  # a program that it had, which may go on
+        place = self._board.place(Role.SECOND if name == "gate" else Role.FIRST)
+        if pid := place.end_speaker(SPEAKS * self._settings.period_s):  # a program that it had may go on
             self._log.line("ERROR", f"process {pid} of the {name} stood still as it told the wheels something: ended")
         self._dead.append(child)
         if name == "gate":

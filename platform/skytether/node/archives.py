@@ -18,8 +18,7 @@ import posixpath
 import re
 import secrets
 import tarfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from pathlib import PurePosixPath
 from typing import Any
@@ -134,19 +133,14 @@ def pull_stat(headers: Mapping[str, str]) -> dict[str, Any] | None:
     """What an engine says of one file in the heads of its answer, whose names are in lower case."""
     try:
         stat = json.loads(base64.b64decode(headers[STAT.lower()]))
-        return {
-            "name": str(stat["name"]),
-            "size": int(stat["size"]),
-            "mode": int(stat["mode"]),
-            "mtime": str(stat["mtime"]),
-        }
+        return {"size": int(stat["size"]), "mode": int(stat["mode"]), "mtime": str(stat["mtime"])}
     except (LookupError, TypeError, ValueError):
         return None
 
 
-def push_stat(stat: Mapping[str, Any]) -> str:
-    """The same as an engine says it; of no link."""
-    return base64.b64encode(json.dumps({**stat, "linkTarget": ""}).encode()).decode()
+def push_stat(name: str, stat: Mapping[str, Any]) -> str:
+    """The same as an engine says it of a file, which is no link."""
+    return base64.b64encode(json.dumps({"name": name, **stat, "linkTarget": ""}).encode()).decode()
 
 
 def is_odd(stat: Mapping[str, Any]) -> bool:
@@ -173,19 +167,12 @@ class Images:
         """
         wanted = sorted(paths)
         if new := [path for path in wanted if (image, path) not in self._known]:
-            with self._made(image) as container:
-                found = {(image, path): self._is_odd(container, path) for path in new}
+            found = self._inspect(image, new)
             self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
             return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
         return next((path for path in wanted if self._known[image, path]), None)
 
-    @contextmanager
-    def _made(self, image: str) -> Iterator[str]:
-        """A container of an image, by its id.
-
-        Raises:
-            ValueError: It could not be made; or whoever removed it meanwhile had it seem empty.
-        """
+    def _inspect(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
         body = {
             "Image": image,
             "Entrypoint": ["/never-started"],
@@ -203,12 +190,13 @@ class Images:
             raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
         container = json.loads(made.content)["Id"]
         try:
-            yield container
+            found = {(image, path): self._is_odd(container, path) for path in paths}
         except BaseException:
             self._remove(container)
             raise
         if not self._remove(container):
             raise ValueError("what was made of its image was removed meanwhile")  # and nothing was found there
+        return found
 
     def _remove(self, container: str) -> bool:
         return (

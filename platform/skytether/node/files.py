@@ -77,7 +77,7 @@ class Files:
             told = pull_stat(answer.headers) if answer.status == HTTPStatus.OK else None
         if told is None or is_odd(told):
             return HTTPStatus.NOT_FOUND, b"", JSON
-        return HTTPStatus.OK, b"", f"{STAT}: {push_stat({**told, 'name': PurePosixPath(path).name})}"
+        return HTTPStatus.OK, b"", f"{STAT}: {push_stat(PurePosixPath(path).name, told)}"
 
     async def read(self, container: str, path: str) -> tuple[int, bytes, str]:
         """A report, in an archive as an engine would make it.

@@ -53,11 +53,13 @@ def holds(text: str) -> bool:
     entries = profile.get("syscalls") or []
     if not isinstance(entries, list) or not all(isinstance(one, dict) and _closed(one) for one in entries):
         return False
+    refused, always = set[str](), set[str]()
     for one in entries:
-        if _refuses(one.get("action")) and not _NEEDED.isdisjoint(_named(one)):
-            return False
-    always = (one for one in entries if not any(one.get(key) for key in ("args", "includes", "excludes")))
-    return {name for one in always if not _refuses(one.get("action")) for name in _named(one)} >= _NEEDED
+        if _refuses(one.get("action")):
+            refused |= _named(one)
+        elif not any(one.get(key) for key in ("args", "includes", "excludes")):
+            always |= _named(one)
+    return always >= _NEEDED and not refused & _NEEDED
 
 
 def keeps_in(text: str) -> bool:

@@ -56,7 +56,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
         stand = Twist() if way.cmd_vel_type == Twist.TYPE else TwistStamped()
         farewell = encode(stand) if role == "guard" else b""
         endpoint = _endpoint(Kind.PUBLISHER, self._topic, way.cmd_vel_type)
-        self._speaks_s = timing.fresh_s / 4
+        self._speaks_s = timing.fresh_s / 4  # of 1.5 periods: who says something for longer stands still
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         publish = partial(self._node.publish, fresh_s=timing.fresh_s, stuck_s=timing.stuck_s)
         self._publication = publish(endpoint, farewell=farewell, farewell_after_s=timing.brakes_s)
