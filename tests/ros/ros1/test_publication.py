@@ -127,6 +127,20 @@ def test_who_begins_to_listen_after_somebody_has_left_counts():
     run(work)
 
 
+def test_where_it_is_known_who_turns_the_wheels_nobody_else_counts():
+    async def work(publication, connect):
+        for name, renewed in (("/tool", 0), ("/tool", 0), ("/base", 1), ("/tool", 1), ("/base", 2)):
+            _, writer, _ = await connect(callerid=name)
+            while not publication.subscribers:
+                await asyncio.sleep(0.001)
+            assert publication.renewed == renewed
+            writer.close()
+            while publication.subscribers:
+                await asyncio.sleep(0.001)
+
+    run(work, awaited=["/base"])
+
+
 def test_what_is_too_old_by_the_time_that_it_is_sent_is_not():
     """The process stood still between `publish` and the thread of the node, or before a slow subscriber had room."""
     now = 100.0

@@ -85,6 +85,9 @@ class GateSection(Numbers):
     """The gate's nodes are called so with ``_guard``, ``_gate``, ``_sensors`` and ``_display`` after it."""
     cmd_vel: Topic = "cmd_vel"
     """What the wheels listen to; nobody else may publish it."""
+    wheels_nodes: tuple[Topic, ...] = ()
+    """Nodes that turn the wheels, where they are known: others listen to ``cmd_vel``, come and go, and it is no
+    reason to stand. Empty: whoever listens may be one."""
 
 
 Section = TypeVar("Section", bound=RobotSection)

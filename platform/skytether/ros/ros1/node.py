@@ -13,7 +13,7 @@ import ipaddress
 import os
 import socket
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Collection, Coroutine, Mapping
 from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
@@ -231,6 +231,7 @@ class Node:
         queue: int = QUEUE,
         hold_s: float = 0.0,
         speaking: Speaking = contextlib.nullcontext,
+        awaited: Collection[str] = (),
     ) -> Publication:
         """Publish a topic.
 
@@ -243,6 +244,7 @@ class Node:
             queue: Messages that wait for a slow subscriber; the newest win.
             hold_s: How long messages wait for a first subscriber while there is none; as many as in the queue.
             speaking: Entered while the node's thread looks whether a message is still fresh, and sends it.
+            awaited: Names of the nodes that it is for, as `Publication.renewed` counts them; empty: any that listens.
 
         Raises:
             ValueError: This node publishes it already.
@@ -259,6 +261,7 @@ class Node:
             queue=queue,
             hold_s=hold_s,
             speaking=speaking,
+            awaited=awaited,
         )
         with self._lock:
             if topic in self._publications:

@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 from math import inf
 
@@ -103,7 +103,7 @@ class Publication:
         topic: Absolute name.
         type: As ROS 1 has it, ``sensor_msgs/LaserScan``.
         md5: Of the type.
-        renewed: How often somebody began to listen who may have left before.
+        renewed: How often somebody began to listen who may have left before, or is awaited.
     """
 
     def __init__(
@@ -120,6 +120,7 @@ class Publication:
         hold_s: float = 0.0,
         speaking: Speaking = nullcontext,
         clock: Callable[[], float] = boottime,
+        awaited: Collection[str] = (),
     ) -> None:
         self.topic = topic
         self.type = ros1_type(kind)
@@ -147,7 +148,7 @@ class Publication:
         self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self.renewed = 0
-        self._comers = Comers()
+        self._comers = Comers(awaited)
         self._refused: set[tuple[str, str]] = set()
 
     @property

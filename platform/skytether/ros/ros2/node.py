@@ -11,7 +11,7 @@ import logging
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import chain, repeat
 from math import inf
@@ -92,9 +92,10 @@ class Ros2Node(NodeBase):
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
         stuck_s: float | None = None,
+        awaited: Collection[str] = (),
     ) -> Publication:
         """Be a publisher; a farewell is not said, because a router has no way to do it for us, and none waits here."""
-        del farewell, farewell_after_s, fresh_s, stuck_s
+        del farewell, farewell_after_s, fresh_s, stuck_s, awaited
         publication = Publication(self, endpoint)
         publication.waits = waits
         return self._add(publication)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -78,9 +78,10 @@ class NodeBase(ABC):
         """What others have on the graph now."""
         return [e for e in self._known.values() if name in (None, e.name) and kind in (None, e.kind)]
 
-    def lives(self, name: str, kind: Kind) -> set[str]:
-        """Something for each endpoint of a name and kind that is another after it was away."""
-        return {key for key, e in self._known.items() if (e.name, e.kind) == (name, kind)}
+    def lives(self, name: str, kind: Kind, nodes: Collection[str] = ()) -> set[str]:
+        """Something for each endpoint of a name and kind that is another after it was away; of these nodes, if any."""
+        found = {key: e for key, e in self._known.items() if (e.name, e.kind) == (name, kind)}
+        return {key for key, e in found.items() if not nodes or e.node in nodes}
 
     def definition(self, type_name: str) -> str | None:  # noqa: ARG002 - nodes that can tell do
         """Definition of a type, with all that it is made of: empty: nobody knows it; None: not yet."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from math import inf
 from typing import Protocol
 
@@ -99,6 +99,7 @@ class GraphNode(Protocol):
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
         stuck_s: float | None = None,
+        awaited: Collection[str] = (),
     ) -> Publication:
         """Be a publisher.
 
@@ -111,6 +112,8 @@ class GraphNode(Protocol):
                 published [s].
             stuck_s: The same of what waits behind something that waits for longer than this, and none is taken until
                 then [s]; None: as ``fresh_s``.
+            awaited: Full names of the nodes that it is for, as `Publication.renewed` counts them; empty: any that
+                listens.
         """
         ...
 
@@ -142,8 +145,8 @@ class GraphNode(Protocol):
         """What others have on the graph now."""
         ...
 
-    def lives(self, name: str, kind: Kind) -> set[str]:
-        """Something for each endpoint of a name and kind that is another after it was away."""
+    def lives(self, name: str, kind: Kind, nodes: Collection[str] = ()) -> set[str]:
+        """Something for each endpoint of a name and kind that is another after it was away; of these nodes, if any."""
         ...
 
     def definition(self, type_name: str) -> str | None:

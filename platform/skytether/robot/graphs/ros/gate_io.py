@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Collection, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from skytether.control.admittance import Velocity
@@ -10,6 +11,8 @@ from skytether.messages import Message, Twist, Vector3
 
 from ..inbox import Inbox
 from ..wheels_watch import NOBODY, Others, WheelsWatch
+
+_log = logging.getLogger(__name__)
 
 
 class _Closes(Protocol):
@@ -44,6 +47,26 @@ class RosWheels(RosGateNode[Node]):
 
     _watch: WheelsWatch | None = None
     """Of the gate, which looks who else publishes the topic."""
+    _missed = False
+
+    def _look_for(self, awaited: Collection[str], there: Collection[str], topic: str) -> None:
+        """Tell once that those who turn the wheels do not listen, though others do.
+
+        Args:
+            awaited: Full names of their nodes; empty: it may be anybody.
+            there: Of those who listen.
+            topic: The wheels'.
+        """
+        missed = bool(awaited and there) and not {*awaited} & {*there}
+        if missed and not self._missed:
+            others = ", ".join(sorted({name or "a node without a name" for name in there}))
+            _log.warning(
+                "%s: none of wheels_nodes (%s) listens, only %s; the wheels are told nothing until one does",
+                topic,
+                ", ".join(awaited),
+                others,
+            )
+        self._missed = missed
 
     def full(self) -> bool:
         """Wheels: never; what nobody takes in time is thrown away."""

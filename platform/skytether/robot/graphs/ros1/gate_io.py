@@ -47,8 +47,9 @@ class Ros1Wheels(RosWheels[Node]):
         super().__init__(_start(way, role))
         topic = resolve(way.cmd_vel, way.namespace)
         speaking = Speaking(*place) if place else nullcontext
+        self._nodes = [resolve(name, way.namespace) for name in way.wheels_nodes]
         self._publication = self._node.advertise(
-            topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1, speaking=speaking
+            topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1, speaking=speaking, awaited=self._nodes
         )
         if role == "gate":
             own = [resolve(f"{way.node}_{each}", way.namespace) for each in ("guard", "gate")]
@@ -72,9 +73,13 @@ class Ros1Wheels(RosWheels[Node]):
         return ""
 
     def listeners(self) -> frozenset[str]:
-        """Wheels: the nodes that listen."""
+        """Wheels: the nodes that listen, of those that turn the wheels."""
         # Beside a recorder, say, the wheels' node may have been started again.
-        return frozenset(f"{name} {self._publication.renewed}" for name in self._publication.subscribers)
+        names = self._publication.subscribers
+        self._look_for(self._nodes, names, self._publication.topic)
+        return frozenset(
+            f"{name} {self._publication.renewed}" for name in names if not self._nodes or name in self._nodes
+        )
 
 
 class Ros1Sensors(RosSensors[Node]):

@@ -40,3 +40,8 @@ class Ros1Way(GateSection, Ros1Link):
     @classmethod
     def _a_name(cls, name: str) -> str:
         return check_name(name)
+
+    @field_validator("wheels_nodes")
+    @classmethod
+    def _names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_name(name) for name in names)

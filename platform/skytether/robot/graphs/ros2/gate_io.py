@@ -59,7 +59,8 @@ class Ros2Wheels(RosWheels[GraphNode]):
         self._speaks_s = timing.fresh_s / 4  # of 1.5 periods: who says something for longer stands still
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         publish = partial(self._node.publish, fresh_s=timing.fresh_s, stuck_s=timing.stuck_s)
-        self._publication = publish(endpoint, farewell=farewell, farewell_after_s=timing.brakes_s)
+        self._nodes = [resolve(name, way.namespace) for name in way.wheels_nodes]
+        self._publication = publish(endpoint, farewell=farewell, farewell_after_s=timing.brakes_s, awaited=self._nodes)
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
             self._watch = WheelsWatch(self._topic, own, self._publishers)
@@ -90,12 +91,15 @@ class Ros2Wheels(RosWheels[GraphNode]):
         return f"{self._topic} is not acknowledged by {' or '.join(names)}; they are braked until it is"
 
     def listeners(self) -> frozenset[str]:
-        """Wheels: the nodes that listen, none while they cannot be told anything."""
+        """Wheels: the nodes that listen, of those that turn the wheels; none while they cannot be told anything."""
         if self._publication.stuck and self._place is not None:  # who would take over may be dead
             self._place.end_speaker(self._speaks_s)
         if self._publication.stuck or self._publication.refused:
             return frozenset()
-        lives = self._node.lives(self._topic, Kind.SUBSCRIPTION)
+        lives = self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes)
+        if self._nodes:
+            there = [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.SUBSCRIPTION)]
+            self._look_for(self._nodes, there, self._topic)
         # Beside a recorder, say, the wheels' node may have been started again.
         return frozenset(f"{life} {self._publication.renewed}" for life in lives)
 

@@ -30,3 +30,17 @@ class Ros2Way(Ros2Link, Ros2Velocity, GateSection):
     @classmethod
     def _a_name(cls, name: str) -> str:
         return check_name(name, 2)
+
+    @field_validator("wheels_nodes")
+    @classmethod
+    def _names(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(check_name(name, 2) for name in names)
+
+    @model_validator(mode="after")
+    def _names_are_told(self) -> Ros2Way:
+        if self.wheels_nodes and self.dialect != "rclpy":
+            raise ValueError(
+                "wheels_nodes: a graph of Zenoh does not always tell whose a subscription is; leave it out, or join "
+                "with dialect: rclpy"
+            )
+        return self

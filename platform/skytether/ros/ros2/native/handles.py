@@ -109,9 +109,11 @@ class Publication(Handle):
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
         stuck_s: float | None = None,
+        awaited: Collection[str] = (),
     ) -> None:
         super().__init__(host, channel, endpoint)
         self._waits = waits
+        self._awaited = awaited
         self._farewell = farewell
         self._farewell_after_s = farewell_after_s
         self._fresh_s = fresh_s
@@ -224,6 +226,7 @@ class Publication(Handle):
                 depth=ours.qos.depth,
                 farewell=base64.b64encode(self._farewell).decode(),
                 farewell_after_s=self._farewell_after_s,
+                awaited=list(self._awaited),
             )
         )
         if self._kept is not None:

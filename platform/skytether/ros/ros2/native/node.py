@@ -15,7 +15,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, TypeVar
@@ -127,6 +127,7 @@ class RclpyNode(NodeBase):
         farewell_after_s: float = 0.0,
         fresh_s: float = inf,
         stuck_s: float | None = None,
+        awaited: Collection[str] = (),
     ) -> Publication:
         """Be a publisher; see `skytether.ros.ros2.seam.GraphNode`."""
         return self._add(
@@ -139,6 +140,7 @@ class RclpyNode(NodeBase):
                 farewell_after_s=farewell_after_s,
                 fresh_s=fresh_s,
                 stuck_s=stuck_s,
+                awaited=awaited,
             )
         )
 

@@ -10,9 +10,14 @@ MOST = 256
 
 
 class Comers:
-    """Knows who listens to one topic, by the names of nodes."""
+    """Knows who listens to one topic, by the names of nodes.
 
-    def __init__(self) -> None:
+    Args:
+        awaited: Names of the nodes that it is about; empty: it may be anybody.
+    """
+
+    def __init__(self, awaited: Collection[str] = ()) -> None:
+        self._awaited = frozenset(awaited)
         self._here: Counter[str] = Counter()
         self._away: dict[str, None] = {}
         """Who left and has not come back, the one who left first at first; empty: somebody whose name nobody knew."""
@@ -23,7 +28,7 @@ class Comers:
         return "" in self._here
 
     def is_anybody_back(self, names: Collection[str], *, all_live: bool = False) -> bool:
-        """Whether somebody came who may have been there before.
+        """Whether somebody came who may have been there before, or is awaited.
 
         Whoever comes may be one who left by another name. A name that is there twice is of one who was killed, too, and
         whose node the graph still shows.
@@ -32,6 +37,8 @@ class Comers:
             names: Of all who listen now, one for each subscription; empty where it is not known.
             all_live: Everybody who was there is: who comes without a name yet is nobody who was killed.
         """
+        if self._awaited:
+            return self._is_one_new(names, all_live)
         here = Counter(names)
         came, gone = here - self._here, self._here - here
         unnamed = gone.pop("", 0)
@@ -47,3 +54,11 @@ class Comers:
             del self._away[next(iter(self._away))]
         self._here = here
         return back
+
+    def _is_one_new(self, names: Collection[str], all_live: bool) -> bool:
+        here = Counter(name for name in names if not name or name in self._awaited)
+        came = here - self._here
+        unnamed = came.pop("", 0)
+        new = bool(came) or (unnamed > 0 and not (all_live and any(self._here)))
+        self._here = here
+        return new

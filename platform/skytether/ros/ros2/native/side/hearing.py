@@ -19,12 +19,15 @@ HEARS_S = 3.0
 class Hearing:
     """Of one publisher.
 
+    Args:
+        awaited: Names of the nodes that it is for; empty: any that listens.
+
     Attributes:
         heard: Whether somebody listens, and is known to hear.
         unread_s: For how long somebody who listens, and did, has not acknowledged what was published [s].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, awaited: Collection[str] = ()) -> None:
         self.heard = False
         self.unread_s = 0.0
         self._read_at: float | None = None
@@ -33,7 +36,7 @@ class Hearing:
         """Since when somebody listens to what was published [s]."""
         self._listeners = 0
         self._read = False
-        self._comers = Comers()
+        self._comers = Comers(awaited)
 
     def update(self, listeners: int, read: bool, now: float, nodes: Callable[[], Collection[Listener]]) -> None:
         """A message is about to be published.

@@ -264,12 +264,13 @@ class Program:
         depth: int,
         farewell: str,
         farewell_after_s: float,
+        awaited: list[str],
     ) -> None:
         self._names[channel] = name
         self._sender.set(channel, FIRST, 1)
         qos = graph.profile(reliable, transient_local, depth)
         self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
-        self._hearing[channel] = Hearing()
+        self._hearing[channel] = Hearing(awaited)
         if farewell:
             self._farewells[channel] = base64.b64decode(farewell), farewell_after_s
 
