@@ -224,7 +224,7 @@ HOST: dict[str, Any] = {
                     {"Type": "volume", "Target": "/d", "VolumeOptions": {"Labels": {str(i): "" for i in range(65)}}}
                 ]
             },
-            "a volume of more than 64 labels",
+            "a volume with more than 64 labels",
         ),
         (
             {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"DriverConfig": {"Options": {}}}}]},
@@ -411,6 +411,23 @@ def test_nothing_is_made_by_a_name_that_somebody_else_has_or_looks_for(name: str
     for odd in ("skt-", "skt-+", "skt-a/b", "skt-0123456789ab", "br0", None):
         changed = {**network, "Name": "skytether", "Options": {"com.docker.network.bridge.name": odd}}
         assert "a bridge of its own" in str(asked("POST", "/networks/create", changed))
+
+
+@pytest.mark.parametrize("labels", [{"skytether.io/network": "x"}, {}])
+def test_nothing_is_made_that_is_nobodys(labels: dict[str, str]) -> None:
+    """The node says that of what it makes itself: no orchestrator could remove it, in whose way it is."""
+    labels = {**labels, "skytether.io/owner": "-"}
+    bridge = {"com.docker.network.bridge.name": "skt-0123456789"}
+    network = {"Name": "skytether-n", "CheckDuplicate": True, "Driver": "bridge", "Options": bridge}
+    mount = {"Type": "volume", "Target": "/data", "VolumeOptions": {"Labels": labels}}
+    for path, body, query in (
+        ("/networks/create", network, {}),
+        ("/volumes/create", {"Name": "skytether-v"}, {}),
+        ("/containers/create", {"Image": "a", "HostConfig": HOST}, {"name": "skytether-c"}),
+    ):
+        assert "of what is nobody's" in str(asked("POST", path, {**body, "Labels": labels}, **query))
+    container = {"Image": "a", "Labels": OWNER, "HostConfig": {**HOST, "Mounts": [mount]}}
+    assert "of what is nobody's" in str(asked("POST", "/containers/create", container, name="skytether-c"))
 
 
 def test_no_orchestrator_takes_the_name_of_what_the_node_makes_itself() -> None:

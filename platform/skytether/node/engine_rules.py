@@ -161,8 +161,8 @@ def _judge(kind: str, name: str, call: Call, devices: Iterable[str]) -> _Judgeme
         return "the call wants an object", ()
     if body is not None and not expects:
         return "the call has a body", ()
-    if expects and len(_at(body, "Labels")) > _MOST_LABELS:
-        return f"it has more than {_MOST_LABELS} labels", ()
+    if expects and (odd := _labels(body)):
+        return f"it has {odd}", ()
     match kind:
         case "create":
             return _created(call, devices)
@@ -357,8 +357,8 @@ def _mount(mount: Any) -> str | None:
     if mount.get("Source") and options.get("NoCopy") is not True:
         # An engine writes into it from the outside, and follows a link that somebody who has it too puts there.
         return "it copies files of its image into a volume that others may have"
-    if len(_at(options, "Labels")) > _MOST_LABELS:
-        return f"it has a volume of more than {_MOST_LABELS} labels"
+    if odd := _labels(options):
+        return f"it has a volume with {odd}"
     return _only(options, {"Labels", "NoCopy"}, "a volume") or _only(
         mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount"
     )
@@ -404,6 +404,13 @@ def _volume(body: Mapping[str, Any]) -> str | None:
     if not str(body.get("Name", "")).startswith(_OURS) or OWNER not in _at(body, "Labels"):
         return "it is no volume of ours"
     return _only(body, {"Name", "Driver", "DriverOpts", "Labels"}, "a volume")
+
+
+def _labels(given: Mapping[str, Any]) -> str | None:
+    labels = _at(given, "Labels")
+    if labels.get(OWNER) == NOBODY:  # which is the node's own word: no orchestrator could remove it any more
+        return f"the label {OWNER} of what is nobody's"
+    return f"more than {_MOST_LABELS} labels" if len(labels) > _MOST_LABELS else None
 
 
 def _only(given: Mapping[str, Any], known: Set[str], what: str) -> str | None:
