@@ -6,6 +6,7 @@ import re
 
 import pytest
 from rich.progress import Progress, TextColumn
+from rich.table import Table
 
 from skytether.cli.output import SafeConsole, log_to_console, print_foreign, print_table
 
@@ -25,6 +26,18 @@ def test_in_a_narrow_terminal_names_and_ids_stay_whole(monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert "0123456789abcdef" in shown
     assert "\N{HORIZONTAL ELLIPSIS}" not in shown, "what does not fit is folded"
+
+
+def test_what_goes_to_a_file_has_each_row_on_one_line(monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    row = [f"column {number}" for number in range(30)]
+    print_table(row, [row])
+    table = Table(*row)
+    table.add_row(*row)
+    SafeConsole(stderr=True).print(table)
+    shown = capsys.readouterr()
+    assert len(shown.out.splitlines()) == 2
+    assert [line.count("column") for line in shown.err.splitlines()] == [0, 30, 0, 30, 0]
 
 
 @pytest.mark.parametrize(("terminal", "shown"), [(True, "a       \\x1b[2Jb\\r\\x00\n"), (False, "a\tb\r\x00\n")])

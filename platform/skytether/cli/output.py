@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
-from rich.console import Console
+from rich.console import Console, ConsoleOptions
 from rich.markup import escape
 from rich.segment import Segment
 from typing_extensions import override
@@ -24,12 +24,21 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 _WIDE = 10_000
-"""Columns of a table that goes to a pipe or a file: more than any row has."""
+"""Columns of what goes to a pipe or a file: more than any row of a table has."""
 _PRIVATE = {"session": {"key"}}
 
 
 class SafeConsole(Console):
-    """A terminal gets no codes but rich's own, wherever the text is from that is among its output."""
+    """A terminal gets no codes but rich's own, wherever the text is from that is among its output.
+
+    What is no terminal gets each line whole: a program that reads lines must not find one row on two of them.
+    """
+
+    @property
+    @override
+    def options(self) -> ConsoleOptions:
+        bounded = self.is_terminal or self._width is not None or "COLUMNS" in self._environ
+        return super().options if bounded else super().options.update(width=_WIDE)
 
     @override
     def _render_buffer(self, buffer: Iterable[Segment]) -> str:
@@ -123,9 +132,8 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def print_whole(table: Table) -> None:
-    """A table on standard output; a program that reads lines must not find one row on two of them."""
-    out = SafeConsole(highlight=False)
-    out.print(table) if out.is_terminal else SafeConsole(highlight=False, width=_WIDE).print(table)
+    """A table on standard output."""
+    SafeConsole(highlight=False).print(table)
 
 
 def log_to_console() -> None:
