@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
-from rich.console import Console, ConsoleOptions
+from rich.console import Console
 from rich.markup import escape
 from rich.segment import Segment
 from typing_extensions import override
@@ -34,11 +34,10 @@ class SafeConsole(Console):
     What is no terminal gets each line whole: a program that reads lines must not find one row on two of them.
     """
 
-    @property
-    @override
-    def options(self) -> ConsoleOptions:
-        bounded = self.is_terminal or self._width is not None or "COLUMNS" in self._environ
-        return super().options if bounded else super().options.update(width=_WIDE)
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**how)
+        if self._width is None and not self.is_terminal:
+            self.width = _WIDE
 
     @override
     def _render_buffer(self, buffer: Iterable[Segment]) -> str:
