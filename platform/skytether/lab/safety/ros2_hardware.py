@@ -28,7 +28,7 @@ _STOP_S = 3.0
 
 
 class Ros2Hardware:
-    """Remembers with each velocity when its node took it, and when it was sent at the earliest.
+    """Remembers with each velocity when its node took it, and when it was published, as DDS tells.
 
     Args:
         folder: Of the gate's sockets; the node's log is there too.
@@ -116,5 +116,5 @@ class Ros2Hardware:
         if not self._joined.is_set():  # it is ready
             self._joined.set()
             return
-        taken, earliest, x, z = said
-        self.record.add(SentVelocity(taken, Velocity(x, z), earliest=min(earliest, taken)))
+        taken, published, x, z = said
+        self.record.add(SentVelocity(taken, Velocity(x, z), earliest=min(published, taken)))

@@ -2,9 +2,8 @@
 
 ``{"do": "send", "topic": ..., "data": base64 of CDR}``, ``vanish``, ``appear``; ``intrude`` and ``leave``: another node
 listens to the velocities, as if they were of another type. It says ``ready``,
-then ``[taken, earliest, x, z]`` for each velocity: times [s] of CLOCK_BOOTTIME. It was sent after it was published, as
-DDS tells by its writer's clock, and where its writer stood still in between, no more than `_HELD_S` before nothing
-waited here last: by then somebody else is to tell the wheels, or they stand.
+then ``[taken, published, x, z]`` for each velocity: both times [s] of CLOCK_BOOTTIME, the second by DDS, which has the
+writer's.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ from sensor_msgs.msg import Joy, LaserScan
 from std_msgs.msg import Bool, String
 
 _SENSORS = {"scan": LaserScan, "estop": Bool, "joy": Joy}
-_WAIT_S = 0.1
-_HELD_S = 0.1
 _DEPTH = 100
 """Of the wheels' subscription: what comes in one go is seen, whole."""
 
@@ -47,9 +44,6 @@ class _Played:
         self._sensors = {name: self._node.create_publisher(kind, name, quality) for name, kind in _SENSORS.items()}
         self._subscription: Any = None
         self._stranger: Any = None
-        self._taken = 0
-        self._idle = 0.0
-        """When no velocity waited last [s]."""
         self._do_appear()
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -58,12 +52,7 @@ class _Played:
         threading.Thread(target=self._read, daemon=True).start()
         print(json.dumps("ready"), file=self._answers, flush=True)
         with contextlib.suppress(ExternalShutdownException):
-            while True:
-                looked, taken = _since_start(), self._taken
-                self._executor.spin_once(timeout_sec=0.0)
-                if self._taken == taken:
-                    self._idle = looked
-                    self._executor.spin_once(timeout_sec=_WAIT_S)
+            self._executor.spin()
 
     def _read(self) -> None:
         for line in sys.stdin:
@@ -98,11 +87,9 @@ class _Played:
 
     def _on_velocity(self, message: Any, info: Any) -> None:
         taken = _since_start()
-        self._taken += 1
-        published = taken - (time.time() - info["source_timestamp"] * 1e-9)
-        earliest = max(published, min(self._idle, taken - _HELD_S))
+        ago = time.time() - info["source_timestamp"] * 1e-9
         twist = message.twist if self._stamped else message
-        print(json.dumps([taken, earliest, twist.linear.x, twist.angular.z]), file=self._answers, flush=True)
+        print(json.dumps([taken, taken - ago, twist.linear.x, twist.angular.z]), file=self._answers, flush=True)
 
 
 _Played(sys.argv[-2], sys.argv[-1] == "stamped").run()
