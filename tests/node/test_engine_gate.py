@@ -746,6 +746,16 @@ def test_of_all_that_an_engine_has_only_what_is_ours_is_told(engine: Engine) -> 
     assert json.loads(got.partition(b"\r\n\r\n")[2]) == {"Volumes": [ours]}
 
 
+def test_all_is_weighed_however_much_an_engine_has_to_tell(engine: Engine) -> None:
+    """With 75 volumes of many labels, of nobody's it was known any more what services wrote."""
+    labels = {"skytether.io/owner": "edge", **{str(number): "a" * 4000 for number in range(60)}}
+    engine.volumes = [{"Name": f"v{number}", "Labels": labels, "UsageData": {"Size": number}} for number in range(80)]
+    got = say(engine, request("GET /v1.41/system/df?type=volume&verbose=1"))
+    told = json.loads(got.partition(b"\r\n\r\n")[2])["Volumes"]
+    assert told[79] == {"Name": "v79", "Labels": {"skytether.io/owner": "edge"}, "UsageData": {"Size": 79}}
+    assert len(told) == 80
+
+
 def test_no_container_is_made_of_which_an_engine_has_much_to_tell(engine: Engine) -> None:
     """With 44 of an image with a megabyte of labels no list was read any more, and nothing made for anybody."""
     engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
@@ -1128,13 +1138,63 @@ def test_what_has_ended_is_forgotten_before_there_is_no_room_for_more(engine: En
 
     async def run() -> None:
         site = Site(engine)
-        site.gate._removals._kin = Kin(most=4)  # noqa: SLF001 as many as few containers have
+        kin = site.gate._removals._kin = Kin(most=4)  # noqa: SLF001 as many as few containers have
         await site.start(X)
         await site.start(Y)
-        assert b"503 Service Unavailable" in await site.ask(f"POST /v1.41/containers/{Z}/start")
         engine.running.discard(X)
         await site.start(Z)
+        assert not kin.lost
 
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("slow", [False, True])
+def test_where_there_is_no_room_who_starts_is_not_refused_and_anybody_may_be_kin_of_anything(
+    engine: Engine, slow: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By 520 starts with 64 volumes each, one orchestrator kept all others from ever starting anything."""
+    engine.others = {X: in_volumes("skytether-s"), Y: in_volumes("skytether-t"), Z: in_volumes("skytether-u"), OWN: {}}
+    if slow:
+        monkeypatch.setattr("skytether.node.removals._LOOK_BACK_S", 0.0)
+
+    async def run() -> None:
+        site = Site(engine)
+        site.gate._removals._kin = Kin(most=4)  # noqa: SLF001 as many as few containers have
+        for container in (X, Y, Z):
+            await site.start(container)
+        for running in ({X}, {Y}, {Z}):
+            engine.running = running
+            assert b"409 Conflict" in await site.ask(f"DELETE /v1.41/volumes/{OWN}"), "nobody knows who met whom"
+        assert b"200 OK" in await site.ask(f"DELETE /v1.41/containers/{Z}?v=1&link=0&force=1")
+        assert site.removed == [f"containers/{Z}?link=0&force=1"], "its volumes stay, as long as it runs"
+        engine.running, engine.idle = set(), {X, Y}
+        assert b"200 OK" in await site.ask(f"DELETE /v1.41/volumes/{OWN}?force=0")
+        await site.start(X)
+        assert b"200 OK" in await site.ask("DELETE /v1.41/volumes/skytether-t?force=0"), "now it is known again"
+        assert b"409 Conflict" in await site.ask("DELETE /v1.41/volumes/skytether-s?force=0")
+
+    engine.others |= {"skytether-t": {}, "skytether-s": {}}
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("most", [1 << 17, 10])
+def test_however_much_an_engine_has_to_tell_what_is_asked_for_is_passed_on(
+    engine: Engine, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With lists of more than 16 MiB, a node that was started anew never made anything for anybody again."""
+    monkeypatch.setattr("skytether.node.machine._MOST_LISTED", most)
+    labels = {"skytether.io/owner": "edge", **{str(number): "a" * 4000 for number in range(60)}}
+    engine.volumes = [{"Labels": labels, "Name": f"skytether-{number}"} for number in range(80)]
+    engine.others, engine.running = {X: in_volumes("skytether-s"), Y: in_volumes("skytether-79"), OWN: {}}, {Y}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        for volume in (OWN, "skytether-79"):
+            said = await site.ask(f"DELETE /v1.41/volumes/{volume}")
+            assert (b"409 Conflict" in said) == (most == 10 or volume == "skytether-79")
+
+    engine.others |= {"skytether-79": {}}
     asyncio.run(run())
 
 

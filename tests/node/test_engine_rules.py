@@ -227,6 +227,10 @@ HOST: dict[str, Any] = {
             "a volume with more than 64 labels",
         ),
         (
+            {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"Labels": {"a": "b" * 9000}}}]},
+            "a volume with labels of more than 8 KiB",
+        ),
+        (
             {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"DriverConfig": {"Options": {}}}}]},
             "a volume has 'DriverConfig'",
         ),

@@ -65,12 +65,19 @@ def test_of_whom_none_runs_all_are_forgotten() -> None:
     assert kin.of(("c",)) == {"c", "volume 1"}
 
 
-def test_no_more_than_some_are_known() -> None:
+def test_of_more_than_some_nobody_knows_who_met_whom_until_nobody_runs() -> None:
     kin = Kin(most=3)
     assert kin.has_room(("a", "volume 1", "volume 2"))
-    assert not kin.has_room(("a", "volume 1", "volume 2", "volume 3"))
     kin.meet(("a", "volume 1"))
     assert kin.has_room(("a", "volume 1", "b"))
     assert not kin.has_room(("b", "volume 2"))
+    kin.meet(("b", "volume 2"))
+    assert kin.lost
+    kin.meet(("c", "volume 2"))
+    assert len(kin) == 0
+    kin.keep(("a",))
+    assert kin.lost
     kin.keep(())
-    assert kin.has_room(("b", "volume 2"))
+    assert not kin.lost
+    kin.meet(("b", "volume 2"))
+    assert kin.of(("b",)) == {"b", "volume 2"}

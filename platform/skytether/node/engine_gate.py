@@ -41,7 +41,7 @@ from .engine_rules import (
     published,
 )
 from .files import Files
-from .machine import Answer, is_taken, picked
+from .machine import Answer, is_taken, listed
 from .registries import Registries
 from .removals import BusyError, Removals
 
@@ -81,8 +81,9 @@ _MOST_DESCRIBED = 64 << 10
 _MAKES = ("/containers/create", "/volumes/create")
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
-_WEIGH_S, _MOST_WEIGHED = 300.0, 16 << 20
-"""What an engine may take to say how large all is that it has: seconds, and bytes."""
+_WEIGH_S = 300.0
+"""What an engine may take to say how large all is that it has [s]."""
+_WEIGHED, _OWNED, _SIZE = ("Volumes.item", "VolumeUsage.Items.item"), f"Labels.{OWNER}", "UsageData.Size"
 
 
 class EngineGate:
@@ -332,15 +333,14 @@ class EngineGate:
     async def _weigh(self, target: str) -> tuple[int, bytes, str]:
         """Of what there is what is ours."""
         async with self._weighing:
-            answer = await self._ask(target, patience=_WEIGH_S, most=_MOST_WEIGHED)
-        try:
-            found = picked(
-                answer.content, "Volumes", "VolumeUsage", "Items", "Name", "Labels", OWNER, "UsageData", "Size"
+            there = await self._tried(
+                asyncio.to_thread(listed, self._engine, target, _WEIGHED, ("Name", _OWNED, _SIZE), patience=_WEIGH_S)
             )
-            volumes = found.get("Volumes") or (found.get("VolumeUsage") or {}).get("Items") or ()
-            ours = [one for one in volumes if OWNER in (one.get("Labels") or ())]
-        except (ValueError, AttributeError, TypeError) as error:
-            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+        ours = [
+            {"Name": one["Name"], "Labels": {OWNER: one[_OWNED]}, "UsageData": {"Size": one[_SIZE]}}
+            for one in there
+            if one.keys() >= {"Name", _OWNED, _SIZE}
+        ]
         return HTTPStatus.OK, json.dumps({"Volumes": ours}).encode(), JSON
 
     async def _is_ours(self, subject: Subject) -> bool:

@@ -80,8 +80,8 @@ _HOST = _LIMITS | {
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
-_MOST_LABELS = 64
-"""Of one thing: an engine tells of all of them whenever it lists what it has."""
+_MOST_LABELS, _MOST_LABELLED = 64, 8 << 10
+"""Of one thing, and bytes of these: an engine tells of all of them whenever it lists what it has."""
 PORT = "7600/udp"
 """Inside: where a service's end of the bridge is."""
 _OURS = "skytether-"
@@ -410,7 +410,10 @@ def _labels(given: Mapping[str, Any]) -> str | None:
     labels = _at(given, "Labels")
     if labels.get(OWNER) == NOBODY:  # which is the node's own word: no orchestrator could remove it any more
         return f"the label {OWNER} of what is nobody's"
-    return f"more than {_MOST_LABELS} labels" if len(labels) > _MOST_LABELS else None
+    if len(labels) > _MOST_LABELS:
+        return f"more than {_MOST_LABELS} labels"
+    much = sum(len(key) + len(str(value)) for key, value in labels.items()) > _MOST_LABELLED
+    return f"labels of more than {_MOST_LABELLED >> 10} KiB" if much else None
 
 
 def _only(given: Mapping[str, Any], known: Set[str], what: str) -> str | None:

@@ -7,10 +7,10 @@ of its containers runs: a folder is held by whoever runs, whatever became of the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Set
+from collections.abc import Collection, Iterable, Set
 
 MOST = 1 << 15
-"""Things that are known at a time: a container has 64 volumes at most."""
+"""Things that are known at a time: a container has 64 volumes at most. If there are more, nobody knows who met whom."""
 
 
 class Kin:
@@ -18,6 +18,8 @@ class Kin:
 
     def __init__(self, most: int = MOST) -> None:
         """``most``: things that are known at a time."""
+        self.lost = False
+        """Nobody knows who met whom: anybody may be kin of anything, until nobody runs any more."""
         self._most = most
         self._groups: dict[str, set[str]] = {}
         """By each thing all that are its kin, itself too: one object for all of these."""
@@ -30,7 +32,12 @@ class Kin:
         return len(self._groups) + len(set(things) - self._groups.keys()) <= self._most
 
     def meet(self, things: Iterable[str]) -> None:
-        """These are kin from now on, and all that theirs are."""
+        """These are kin from now on, and all that theirs are; none are known where there is no room for them."""
+        things = set(things)
+        if not self.has_room(things):
+            self.lose()
+        if self.lost:
+            return
         met: set[str] = set()
         for thing in things:
             group = self._groups.get(thing) or {thing}
@@ -40,6 +47,10 @@ class Kin:
             met |= small
             self._groups.update(dict.fromkeys(small, met))
             self._groups[thing] = met
+
+    def lose(self) -> None:
+        """Who met whom is not known any more."""
+        self.lost, self._groups = True, {}
 
     def leave(self, container: str) -> None:
         """It does not run: it holds nothing, and its kin need not be asked for it any more."""
@@ -59,7 +70,8 @@ class Kin:
         for one in self.of(things):
             self._groups.pop(one, None)
 
-    def keep(self, running: Iterable[str]) -> None:
+    def keep(self, running: Collection[str]) -> None:
         """Forget all that has no kin that run."""
         kept = self.of(running)
+        self.lost = self.lost and bool(running)
         self._groups = {one: group for one, group in self._groups.items() if one in kept}

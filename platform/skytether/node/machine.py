@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import hashlib
 import http.client
@@ -12,11 +13,13 @@ import platform
 import re
 import shutil
 import socket
-from collections.abc import Mapping
+import time
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import ijson
 import psutil
 from typing_extensions import override
 
@@ -31,7 +34,14 @@ _MOST = 1 << 20
 """Bytes of an engine's answer."""
 _HEAVY = {"Args", "Cmd", "Entrypoint", "Env", "ExposedPorts", "OnBuild", "Shell", "Volumes"}
 _OURS, _MOST_OF_ONE = "skytether", 4096
+_MOST_LISTED, _LIST_S = 1 << 17, 30.0
+"""Things of a list, and how long it may take to be read [s]."""
+_PLAIN = {"string", "number", "boolean"}
 _STATUS = re.compile(rb"HTTP/1\.[01] ([1-5]\d\d)\b")
+
+
+class TooMuchError(ValueError):
+    """It has more to tell than is listened to."""
 
 
 @dataclass(frozen=True)
@@ -125,16 +135,57 @@ def ask(
         OSError: It does not answer.
         ValueError: It answers something else.
     """
+    with _answered(path, what, method, body, patience) as answer:
+        return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
+
+
+@contextlib.contextmanager
+def _answered(path: str, what: str, method: str, body: Any, patience: float) -> Iterator[http.client.HTTPResponse]:
     connection = _Connection(path, patience)
     try:
         text = None if body is None else json.dumps(body)
         connection.request(method, what, text, {"Content-Type": "application/json"} if text else {})
-        answer = connection.getresponse()
-        return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
+        yield connection.getresponse()
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
     finally:
         connection.close()
+
+
+def listed(
+    path: str, what: str, lists: Collection[str], keys: Collection[str], *, patience: float = _ENGINE_S
+) -> list[dict[str, Any]]:
+    """Of each thing in a list what is asked for: however much there is of all else, it takes no memory.
+
+    Args:
+        path: Of the engine's socket.
+        what: Path and query.
+        lists: Where a thing may be in the document: ``item``, ``Volumes.item``.
+        keys: What is asked for of each, which are no objects: ``Id``, ``HostConfig.NetworkMode``.
+        patience: Seconds for each step of it.
+
+    Raises:
+        OSError: It does not answer.
+        TooMuchError: Of more than `_MOST_LISTED`, or for longer than `_LIST_S`.
+        ValueError: It answers something else.
+    """
+    found: list[dict[str, Any]] = []
+    start, until = "", time.monotonic() + _LIST_S
+    with _answered(path, what, "GET", None, patience) as answer:
+        if answer.status != http.HTTPStatus.OK:
+            raise ValueError(f"it answers {answer.status}")
+        try:
+            for where, event, value in ijson.parse(answer, use_float=True):
+                if event == "start_map" and where in lists:
+                    start = f"{where}."
+                    found.append({})
+                    if len(found) > _MOST_LISTED or time.monotonic() > until:
+                        raise TooMuchError("it has too much to tell")
+                elif found and event in _PLAIN and where.startswith(start) and (key := where[len(start) :]) in keys:
+                    found[-1][key] = value
+        except ijson.JSONError as error:
+            raise ValueError(f"its answer is no JSON: {error}") from error
+    return found
 
 
 async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -> Answer:

@@ -21,13 +21,11 @@ from urllib.parse import urlencode
 
 from .engine_rules import OWNER
 from .kin import Kin
-from .machine import Answer, ask, ask_long, lean, picked
+from .machine import Answer, TooMuchError, ask, ask_long, lean, listed, picked
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
-_MOST_TOLD = 16 << 20
-"""Bytes of what an engine says of many containers, or of all volumes."""
 _LOOK_BACK_S = 15.0
 """In which containers are asked for, one by one, whether they run; after that, each is taken to."""
 _WAIT_S = 30.0
@@ -40,6 +38,8 @@ _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
 _MOST_STARTS, _MOST_REMOVALS = 512, 128
 """Under way at a time: an engine may take its time for each, and whoever asked may be gone meanwhile."""
+_MOST_MINE = 1 << 15
+_MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
 _VOLUME = "volume "
@@ -88,12 +88,12 @@ class Removals:
         things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
         del inspected  # it may be large, and from here on much is waited for
         await self.look_back()
-        if not self._kin.has_room(things):
+        if not self._kin.lost and not self._kin.has_room(things):
             await self._forget_ended()
         await self._until_removed(things)
         # From here to the task nobody else comes between.
-        if not self._kin.has_room(things) or len(self._starts) >= _MOST_STARTS:
-            raise BusyError("too many containers run or start, with too many volumes")
+        if len(self._starts) >= _MOST_STARTS:
+            raise BusyError("too many containers start")
         if container in self._puts:
             raise BusyError("something is being put into it")
         (joined,) = joins or ("",)
@@ -101,8 +101,8 @@ class Removals:
             raise BusyError("the container whose network it joins is being ended")
         self._kin.meet(things)
         self._mine.add(container)
-        if len(self._mine) > len(self._kin):
-            self._mine &= self._kin.all()  # who runs is among these
+        if len(self._mine) > _MOST_MINE:
+            self._mine &= self._kin.all() | self._starts.keys() | {container}
         self._noted += 1
         if (task := self._starts.get(container)) is None:
             if joined:
@@ -214,6 +214,10 @@ class Removals:
             itself: Who ends before the files are removed.
             named: A volume that whoever knows its name could have, another orchestrator at this engine too.
         """
+        if self._kin.lost:
+            await self._find_again()
+        if self._kin.lost:
+            return None
         if len(self._removals) >= _MOST_REMOVALS:
             raise BusyError("too much is being removed")
         task = begun(self._remove(things, path, itself, named=named))
@@ -223,8 +227,8 @@ class Removals:
 
     async def _remove(self, things: Collection[str], path: str, itself: str, *, named: bool) -> Answer | None:
         kin, starting = set(self._kin.of(things)), set(self._starts)
-        if kin & (starting | await self._running(kin - {itself})) or (named and await self._strangers_run()):
-            return None
+        if kin & (starting | await self._running(kin - {itself})) or (named and await self._anybody_runs(self._mine)):
+            return None  # among them, perhaps, whom another program of a node started
         answer = await ask_long(self._engine, path, method="DELETE")
         if answer.status < HTTPStatus.BAD_REQUEST:
             self._kin.forget(things)  # of which none runs
@@ -245,9 +249,20 @@ class Removals:
 
     async def _forget_ended(self) -> None:
         noted, starting = self._noted, set(self._starts)
-        running = await self._running(self._kin.all())
+        try:
+            async with asyncio.timeout(_LOOK_BACK_S):
+                running = await self._running(self._kin.all())
+        except TimeoutError:
+            self._kin.lose()
+            return
         if noted == self._noted:  # or something has started since, of which nobody knows whether it was listed
             self._kin.keep(running | starting)
+
+    async def _find_again(self) -> None:
+        """Know again who met whom, if nobody runs."""
+        noted = self._noted
+        if not self._starts and not await self._anybody_runs() and noted == self._noted:
+            self._kin.keep(())
 
     async def look_back(self) -> None:
         """Once, before anything is made or started: of what runs already nobody knows what it has met."""
@@ -259,16 +274,18 @@ class Removals:
         if self._looked_back:  # meanwhile
             return
         asked_until = time.monotonic() + _LOOK_BACK_S
-        there = await self._told(f"/containers/json?{_OURS}", "Id", "State", "HostConfig", "NetworkMode")
-        listed = {str(one["Id"]): one for one in there}
-        if old := {one for one in listed if time.monotonic() > asked_until or await self._may_run(one)}:
-            for paused in old:
-                if listed[paused].get("State") != "paused":
-                    continue
-                joining = [one for one in old if _joined(listed[one]) == (paused,)]
-                begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
-            volumes = (await self._told("/volumes", "Volumes", "Name"))["Volumes"] or ()
-            self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
+        try:
+            there = {one["Id"]: one for one in await self._containers()}
+            if old := {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}:
+                for paused in old:
+                    if there[paused].get("State") != "paused":
+                        continue
+                    joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
+                    begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
+                volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
+                self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
+        except TooMuchError:
+            self._kin.lose()
         self._looked_back = True
 
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
@@ -299,9 +316,7 @@ class Removals:
         It says nothing of one that it starts just now, as an earlier program may have asked it to.
         """
         try:
-            answer = await asyncio.to_thread(
-                ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S, most=_MOST_TOLD
-            )
+            answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
             if answer.status == HTTPStatus.NOT_FOUND:
                 return False
             return picked(answer.content, "State", "Running")["State"]["Running"] is not False
@@ -316,32 +331,22 @@ class Removals:
             return False
         return True
 
-    async def _strangers_run(self) -> bool:
-        """Whether any runs that another program of a node started: whom that has met nobody here has seen."""
+    async def _anybody_runs(self, but: Collection[str] = ()) -> bool:
+        """Whether any container of orchestrators may run, but for these."""
         async with self._looking:
             try:
-                strangers = await self._listed() - self._mine
+                there = await self._containers()
             except ValueError:
                 return True
-            for container in strangers:
-                if await self._may_run(container):
+            for one in sorted(there, key=lambda one: one.get("State") != "running"):
+                if one["Id"] not in but and await self._may_run(one["Id"]):
                     return True
         return False
 
-    async def _listed(self) -> set[str]:
-        """All containers of orchestrators."""
-        return {str(one["Id"]) for one in await self._told(f"/containers/json?{_OURS}", "Id")}
-
-    async def _told(self, path: str, *keys: str) -> Any:
-        """Of each thing what has one of these keys."""
-
-        def tell() -> Any:
-            answer = ask(self._engine, path, most=_MOST_TOLD)
-            if answer.status != HTTPStatus.OK:
-                raise ValueError(f"it answers {answer.status}")
-            return picked(answer.content, *keys)
-
-        return await asyncio.to_thread(tell)
+    async def _containers(self) -> list[dict[str, Any]]:
+        """All of orchestrators."""
+        keys = ("Id", "State", _MODE)
+        return await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
 
 
 def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
@@ -353,10 +358,12 @@ def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
 
 def _takes_files(content: bytes, own: str) -> bool:
     """Whether a container was never started, and has a volume that it alone has at a path; empty: at none."""
-    found = picked(content, "State", "Status", "Mounts", "Destination", "Name")
+    found = picked(content, "State", "Status", "ExitCode", "Error", "Mounts", "Destination", "Name")
+    state = found.get("State") or {}
+    fresh = state.get("Status") == "created" and not state.get("ExitCode") and not state.get("Error")
     names = [str(one.get("Name")) for one in found.get("Mounts") or () if one.get("Destination") == own]
     alone = bool(names) and all(map(_OWN.fullmatch, names))
-    return (found.get("State") or {}).get("Status") == "created" and (alone or not own)
+    return fresh and (alone or not own)
 
 
 def _volumes(inspected: Mapping[str, Any]) -> tuple[str, ...]:
