@@ -477,6 +477,24 @@ def test_no_container_is_published_at_a_port_that_a_program_of_this_machine_has(
         assert b"200 OK" in say(engine, sent)
 
 
+@pytest.mark.parametrize("address", ["", "127.0.0.1", "::1", "192.0.2.1"])
+def test_where_any_port_is_asked_for_the_node_chooses_one_that_is_free(engine: Engine, address: str) -> None:
+    """An engine tries one after the other, and leads what comes for a machine's program into the container meanwhile."""
+    engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
+    body = json.loads(CREATED % b"skytether")
+    for bound in ({"HostIp": address}, {"HostIp": address, "HostPort": ""}, {"HostIp": address, "HostPort": "7"}):
+        body["HostConfig"]["PortBindings"] = {"7600/udp": [bound]}
+        assert b"201 Created" in say(engine, request("POST /v1.41/containers/create", json.dumps(body).encode()))
+        (sent,) = [sent for line, _, sent in engine.asked if line.endswith("/create")]
+        engine.asked.clear()
+        made = json.loads(sent)["HostConfig"]["PortBindings"]["7600/udp"]
+        port = int(made[0]["HostPort"])
+        assert made == [{"HostIp": address, "HostPort": str(port)}]
+        assert port == 7 if bound.get("HostPort") == "7" else port > 1023
+    engine.container = {"HostConfig": {"NetworkMode": "skytether", "PortBindings": {"7600/udp": [{"HostPort": ""}]}}}
+    assert b"at whatever port" in say(engine, request(f"POST /v1.41/containers/{ID}/start"))
+
+
 def test_of_ports_that_are_for_root_alone_it_is_seen_too_whether_they_are_taken(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

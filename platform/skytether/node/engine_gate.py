@@ -41,7 +41,7 @@ from .engine_rules import (
     published,
 )
 from .files import Files
-from .machine import Answer, is_taken, listed
+from .machine import ANYWHERE, Answer, free_port, is_taken, listed
 from .registries import Registries
 from .removals import BusyError, Removals
 
@@ -302,7 +302,14 @@ class EngineGate:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
     async def _create(self, target: str, said: Any) -> tuple[int, bytes, str]:
-        """A container, if its description is not large: an engine tells all of it, with all others, in each list."""
+        """A container, at a port that is free, if its description is not large.
+
+        An engine tries one after the other, and meanwhile leads there what comes for the machine's own programs. And it
+        tells all of a description, with all others, in each list.
+        """
+        found = ((said.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT)
+        for bound in found if isinstance(found, list) else ():
+            bound["HostPort"] = bound.get("HostPort") or str(free_port(bound.get("HostIp") or ""))
         answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
@@ -376,8 +383,10 @@ def _may_be_published(inspected: Any) -> None:
     for bound in ((inspected.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT) or ():
         if refused := published(bound):
             raise RefusedCall(refused)
-        address, port = bound.get("HostIp") or "0.0.0.0", bound.get("HostPort")  # noqa: S104 (nobody listens)
-        if port and is_taken(address, int(port)):
+        address, port = bound.get("HostIp") or ANYWHERE, bound.get("HostPort")
+        if not port:
+            raise RefusedCall("it was made by an earlier release, and is published at whatever port: make it anew")
+        if is_taken(address, int(port)):
             raise RefusedCall(f"UDP port {port} of {address}: address already in use")
 
 

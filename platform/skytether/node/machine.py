@@ -34,6 +34,7 @@ _MOST = 1 << 20
 """Bytes of an engine's answer."""
 _HEAVY = {"Args", "Cmd", "Entrypoint", "Env", "ExposedPorts", "OnBuild", "Shell", "Volumes"}
 _OURS, _MOST_OF_ONE = "skytether", 4096
+ANYWHERE = "0.0.0.0"  # noqa: S104 (nobody listens)
 _MOST_LISTED, _LIST_S = 1 << 17, 30.0
 """Things of a list, and how long it may take to be read [s]."""
 _PLAIN = {"string", "number", "boolean"}
@@ -325,6 +326,16 @@ def is_taken(address: str, port: int) -> bool:
         except OSError as error:
             return error.errno == errno.EADDRINUSE
     return False
+
+
+def free_port(address: str) -> int:
+    """A UDP port that no program of this machine has, at that address, or at all where it is empty or none of ours."""
+    with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address or ANYWHERE, 0))
+        except OSError:
+            probe.bind(("", 0))
+        return int(probe.getsockname()[1])
 
 
 def _has_port(table: Path, port: int) -> bool:
