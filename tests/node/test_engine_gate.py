@@ -479,7 +479,7 @@ def test_no_container_is_published_at_a_port_that_a_program_of_this_machine_has(
 
 @pytest.mark.parametrize("address", ["", "127.0.0.1", "::1", "192.0.2.1"])
 def test_where_any_port_is_asked_for_the_node_chooses_one_that_is_free(engine: Engine, address: str) -> None:
-    """An engine tries one after the other, and leads what comes for a machine's program into the container meanwhile."""
+    """An engine tries one after the other, and leads what comes for programs into the container meanwhile."""
     engine.networks = {"skytether": {"skytether.io/network": "filtered"}}
     body = json.loads(CREATED % b"skytether")
     for bound in ({"HostIp": address}, {"HostIp": address, "HostPort": ""}, {"HostIp": address, "HostPort": "7"}):

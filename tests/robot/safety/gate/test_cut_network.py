@@ -1,5 +1,9 @@
 """A robot whose wheels are on another computer than its gate, and the network between the two is cut: real ROS 2."""
 
+import os
+import signal
+import subprocess
+import time
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -7,6 +11,7 @@ from pathlib import Path
 import pytest
 from networks import cable
 
+from skytether.guard.clock import now
 from skytether.guard.velocity import STANDSTILL
 from skytether.lab.netns import Namespace
 from skytether.lab.safety.robot import PlayedRobot
@@ -56,3 +61,35 @@ def test_wheels_that_were_cut_off_hear_a_standstill_first(tmp_path, ros2, monkey
     assert back.velocity == STANDSTILL, "by the time at which they heard it, too"
     assert [violation.text for violation in finding.violations] == []
     assert finding.velocity_max > 0.4
+
+
+@pytest.mark.usefixtures("nftables")
+def test_no_velocity_is_sent_again_that_was_lost_before_its_writer_stood_still(tmp_path, ros2, monkeypatch):
+    """DDS had it still, unacknowledged, and sent it seconds later to wheels that the gate had braked long ago."""
+    monkeypatch.setenv("SKYTETHER_ROS2_PYTHON", ros2)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    with two_computers() as (ours, wheels):
+
+        def lose(rule):
+            rules = (
+                f"add table ip t; add chain ip t i {{ type filter hook input priority 0; }}; flush chain ip t i; {rule}"
+            )
+            wheels.run(lambda: subprocess.run(["nft", rules], check=True))
+
+        def freeze():
+            with PlayedRobot(tmp_path, {}, hardware=lambda folder: wheels.run(lambda: Ros2Hardware(folder))) as robot:
+                robot.go()
+                lose("add rule ip t i drop")
+                time.sleep(0.02)
+                os.kill(robot.pid("writer"), signal.SIGSTOP)
+                time.sleep(0.005)
+                frozen = now()
+                lose("")
+                time.sleep(4.0)  # longer than the time after which DDS looks who has not acknowledged what
+                told = robot.record.since(frozen)[1:]
+                os.kill(robot.pid("writer"), signal.SIGCONT)
+                return told
+
+        told = [each.velocity.linear for each in ours.run(freeze)]
+    stood = told.index(0.0)
+    assert max(told[stood:]) == 0.0, "who stands is told no velocity of before"

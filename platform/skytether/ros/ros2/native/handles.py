@@ -226,6 +226,7 @@ class Publication(Handle):
                 depth=ours.qos.depth,
                 farewell=base64.b64encode(self._farewell).decode(),
                 farewell_after_s=self._farewell_after_s,
+                lifespan_s=self._fresh_s if self._fresh_s < inf else None,
                 awaited=list(self._awaited),
             )
         )

@@ -15,13 +15,15 @@ _ENDLESS = 1e9
 """Seconds; what is longer is no deadline."""
 
 
-def profile(reliable: bool, transient_local: bool, depth: int) -> QoSProfile:
-    """A quality of service of ours."""
+def profile(reliable: bool, transient_local: bool, depth: int, lifespan_s: float | None = None) -> QoSProfile:
+    """A quality of service of ours; with ``lifespan_s``, nothing is sent that is older [s]."""
+    more = {} if lifespan_s is None else {"lifespan": Duration(seconds=lifespan_s)}
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if transient_local else DurabilityPolicy.VOLATILE,
+        **more,
     )
 
 

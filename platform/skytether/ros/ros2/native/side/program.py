@@ -12,12 +12,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 from inspect import signature
+from math import inf
 from typing import Any
 
 import rclpy
-from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.service import Service
@@ -36,15 +35,13 @@ from .frames import (
     Frame,
     Kind,
     control,
-    dealt_with,
     fresh,
     numbered,
     pull_frame,
-    pull_fresh,
     pull_number,
     push_head,
 )
-from .hearing import Hearing
+from .fresh import FreshPublisher
 from .outbox import FIRST, Sender
 from .speaking import Speaking
 from .stalls import STOOD_S, TURN_S, Stalls
@@ -64,9 +61,6 @@ NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
 VELOCITIES = {"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"}
 """Late, they are worse than none: whoever has them drives on."""
-FAREWELL_S = 0.3
-"""For the last messages to reach who listens."""
-_AT_ONCE = Duration()
 _TELLS_TIMES = hasattr(Subscription, "CallbackType")
 """Whether this `rclpy` says of a message when it was published."""
 
@@ -128,10 +122,9 @@ class Program:
         self._lock = threading.Lock()
         self._names: dict[int, str] = {}
         self._publishers: dict[int, Any] = {}
-        self._published: dict[int, int] = {}
-        """Of those that are published in time or never."""
+        self._fresh: dict[int, FreshPublisher] = {}
+        """Of those the ones whose messages are published in time or never."""
         self._farewells: dict[int, tuple[bytes, float]] = {}
-        self._hearing: dict[int, Hearing] = {}
         place = start["speaks"]
         self._speaking: Callable[[], contextlib.AbstractContextManager[None]]
         self._speaking = Speaking(*place) if place else contextlib.nullcontext
@@ -177,20 +170,10 @@ class Program:
         for channel, (body, after_s) in sorted(self._farewells.items(), key=lambda item: item[1][1]):
             time.sleep(max(0.0, began + after_s - time.monotonic()))
             with contextlib.suppress(Exception):
-                if not after_s or not self._is_followed(channel):
-                    self._publishers[channel].publish(body)
-        for channel in list(self._farewells):
-            with contextlib.suppress(Exception):
-                self._publishers[channel].wait_for_all_acked(Duration(seconds=FAREWELL_S))
+                self._fresh[channel].say_farewell(body, after_s)
         self._sender.close()
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()
-
-    def _is_followed(self, channel: int) -> bool:
-        """Whether another node of our name publishes the topic by now."""
-        ours = (self._node.get_name(), self._node.get_namespace())
-        infos = self._node.get_publishers_info_by_topic(self._publishers[channel].topic_name)
-        return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
 
     def _send(self, **what: Any) -> None:
         self._sender.put(control(**what))
@@ -223,21 +206,8 @@ class Program:
             if publisher is not None:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
-            number, until, heeds, body = pull_fresh(frame.body)
-            publisher, hearing = self._publishers.get(frame.channel), self._hearing.get(frame.channel, Hearing())
-            if publisher is not None:
-                read = _has_been_read(publisher)
-                nodes = partial(graph.listeners, self._node, publisher.topic_name)
-                hearing.update(publisher.get_subscription_count(), read, _now(), nodes)
-                with self._speaking():
-                    new = _now() <= until and (hearing.heard or not heeds)  # or he is, and it is no first word for him
-                    if new:
-                        publisher.publish(body)
-                if new:
-                    self._published[frame.channel] = self._published.get(frame.channel, 0) + 1
-                    hearing.tell(publisher.get_subscription_count(), _now())
-            published = self._published.get(frame.channel, 0)
-            self._sender.put(dealt_with(frame.channel, number, hearing.unread_s, published, hearing.heard))
+            if (fresh_publisher := self._fresh.get(frame.channel)) is not None:
+                self._sender.put(fresh_publisher.publish(frame))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -264,13 +234,16 @@ class Program:
         depth: int,
         farewell: str,
         farewell_after_s: float,
+        lifespan_s: float | None,
         awaited: list[str],
     ) -> None:
         self._names[channel] = name
         self._sender.set(channel, FIRST, 1)
-        qos = graph.profile(reliable, transient_local, depth)
-        self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
-        self._hearing[channel] = Hearing(awaited)
+        qos = graph.profile(reliable, transient_local, depth, lifespan_s)
+        publisher = self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
+        self._fresh[channel] = FreshPublisher(
+            self._node, publisher, inf if lifespan_s is None else lifespan_s, awaited, self._speaking, _now
+        )
         if farewell:
             self._farewells[channel] = base64.b64decode(farewell), farewell_after_s
 
@@ -346,7 +319,7 @@ class Program:
     def _do_close(self, channel: int) -> None:
         self._names.pop(channel, None)
         self._farewells.pop(channel, None)
-        self._hearing.pop(channel, None)
+        self._fresh.pop(channel, None)
         server = self._servers.pop(channel, None)
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
@@ -454,14 +427,6 @@ class Program:
         unnamed = {e[0] for e in endpoints if not e[5]}
         self._unnamed = {key: self._unnamed.get(key, now) for key in unnamed}
         return [e for e in endpoints if e[5] or now - self._unnamed[e[0]] >= NAMED_S]
-
-
-def _has_been_read(publisher: Any) -> bool:
-    """Whether all who listen have acknowledged all."""
-    try:
-        return bool(publisher.wait_for_all_acked(_AT_ONCE))
-    except Exception:  # this middleware does not tell
-        return True
 
 
 def _now() -> float:

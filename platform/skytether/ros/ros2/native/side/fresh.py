@@ -1,0 +1,91 @@
+"""A publisher whose messages reach somebody in time or never: none waits for longer, neither here nor in DDS."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import Any
+
+from rclpy.duration import Duration
+
+from . import graph
+from .frames import Frame, dealt_with, pull_fresh
+from .hearing import Hearing
+
+FAREWELL_S = 0.3
+"""Within which whoever listens has acknowledged the last word, or is not waited for."""
+_AT_ONCE = Duration(seconds=0)
+Speaking = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+class FreshPublisher:
+    """One.
+
+    DDS keeps a message for who has not acknowledged it, and sends it again, however old it is by then: when the network
+    is there again, say, or this process goes on. So it has a lifespan, after which DDS has it no more.
+
+    Args:
+        node: Of rclpy, which has the publisher.
+        publisher: Reliable or not.
+        lifespan_s: Its messages' [s].
+        awaited: See `Hearing`.
+        speaking: Entered while it is looked whether a message is still fresh, and while it is published.
+        now: The clock that the agent has, too [s].
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        publisher: Any,
+        lifespan_s: float,
+        awaited: Collection[str],
+        speaking: Speaking,
+        now: Callable[[], float],
+    ) -> None:
+        self._node, self._publisher, self._lifespan_s = node, publisher, lifespan_s
+        self._speaking, self._now = speaking, now
+        self._hearing = Hearing(awaited)
+        self._published, self._published_at = 0, now()
+        self._read = True
+
+    def publish(self, frame: Frame) -> Frame:
+        """Publish it, if it is fresh; returns what the agent is told of that."""
+        number, until, heeds, body = pull_fresh(frame.body)
+        hearing, publisher, now = self._hearing, self._publisher, self._now()
+        if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
+            self._read = _has_been_read(publisher, _AT_ONCE)
+        listeners = partial(graph.listeners, self._node, publisher.topic_name)
+        hearing.update(publisher.get_subscription_count(), self._read, now, listeners)
+        with self._speaking():
+            new = self._now() <= until and (hearing.heard or not heeds)  # or he is, and it is no first word for him
+            if new:
+                self._published_at = self._now()
+                publisher.publish(body)
+        if new:
+            self._published += 1
+            hearing.tell(publisher.get_subscription_count(), self._now())
+        return dealt_with(frame.channel, number, hearing.unread_s, self._published, hearing.heard)
+
+    def say_farewell(self, body: bytes, after_s: float) -> None:
+        """Publish a last word until it is acknowledged; with ``after_s``, unless another node of our name speaks."""
+        until = time.monotonic() + FAREWELL_S
+        while time.monotonic() < until and not (after_s and self._is_followed()):
+            self._publisher.publish(body)
+            if _has_been_read(self._publisher, Duration(seconds=min(FAREWELL_S, self._lifespan_s / 2))):
+                return
+
+    def _is_followed(self) -> bool:
+        """Whether another node of our name publishes the topic by now."""
+        ours = (self._node.get_name(), self._node.get_namespace())
+        infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
+        return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
+
+
+def _has_been_read(publisher: Any, within: Duration) -> bool:
+    """Whether all who listen have acknowledged all."""
+    try:
+        return bool(publisher.wait_for_all_acked(within))
+    except Exception:  # this middleware does not tell
+        return True
