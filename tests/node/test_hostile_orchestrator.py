@@ -129,6 +129,25 @@ def test_of_addresses_that_an_orchestrator_tells_few_are_kept_and_no_odd_one(
     assert not any("\n" in line or "\x1b" in line for line in caplog.messages)
 
 
+def test_an_orchestrator_that_is_new_takes_the_place_of_one_that_is_not_told_of_any_more(hostile: Hostile) -> None:
+    """One that was taken over filled all places with what is nowhere, for good."""
+    made_up = [f"https://127.0.0.1:{port}" for port in range(1, 20)]
+    told, over = [(hostile.url, *made_up), (hostile.url, "https://127.0.0.1:5000")], threading.Event()
+
+    def tell(link: ssl.SSLSocket) -> None:
+        if told:
+            link.sendall(hostile.linked(urls=told.pop(0)))
+        over.wait(0.5 if told else 30)
+
+    hostile.answers[Link] = tell
+    with program(hostile.store):
+        until(lambda: "https://127.0.0.1:5000" in hostile.store.config().urls)
+        over.set()
+    kept = hostile.store.config().urls
+    assert kept[0] == hostile.url
+    assert len(kept) == 16
+
+
 def odd_certificate(keys: Path, key: ec.EllipticCurvePrivateKey, odd: str) -> str:
     """What whoever has the authority's key can sign, and no program can use."""
     authority, signer = Authority(keys, time.time), load_pem_private_key((keys / KEY).read_bytes(), None)

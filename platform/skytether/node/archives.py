@@ -31,7 +31,7 @@ _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
 _KERNEL = re.compile(r"/(?:dev|proc|sys)(?:/.*)?", re.DOTALL)
 """What an engine mounts in each container beside, and holds it by."""
-_MOST_MOUNTS, _MOST_WAYS = 64, 512
+_MOST_MOUNTS, _MOST_WAYS = 64, 128
 """Of a container, and folders on the ways to them: an engine mounts all of the first in the machine's own tree, which
 has room for some, whenever it looks into that container; the node asks for each of the second."""
 STAT = "X-Docker-Container-Path-Stat"
@@ -155,6 +155,10 @@ class Images:
         """``engine``: path of its socket."""
         self._engine = engine
         self._known: dict[tuple[str, str], bool] = {}
+
+    def knows(self, image: str, paths: Iterable[str]) -> bool:
+        """Whether `odd` has nothing to ask."""
+        return all((image, path) in self._known for path in paths)
 
     def odd(self, image: str, paths: Iterable[str]) -> str | None:
         """One of these paths that is a link in an image, or no file where there must be one; None: none is.

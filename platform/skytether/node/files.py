@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import os
 import stat
@@ -50,9 +51,10 @@ class Files:
             return
         if status != HTTPStatus.OK or (refused := moved(found)):
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
+        image, paths = str(found["Image"]), ways(found)
         try:
-            async with self._looking:
-                odd = await asyncio.to_thread(self._images.odd, str(found["Image"]), ways(found))
+            async with contextlib.nullcontext() if self._images.knows(image, paths) else self._looking:
+                odd = await asyncio.to_thread(self._images.odd, image, paths)
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if odd:

@@ -304,7 +304,11 @@ def machine_id() -> str:
 
 def address_towards(url: str) -> str | None:
     """This machine's address by which it reaches an orchestrator; None: there is no way there. Nothing is sent."""
-    host, port = address_of(url)
+    return own_address(*address_of(url))
+
+
+def own_address(host: str, port: int) -> str | None:
+    """The same, by which it reaches a host."""
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, kind, protocol) as probe:

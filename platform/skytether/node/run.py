@@ -13,8 +13,9 @@ import resource
 import ssl
 import time
 from asyncio import sslproto
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Collection, Coroutine, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
@@ -43,7 +44,8 @@ from skytether.api.splice import PIECE, Stream, closed, keep_alive, splice
 from . import calls
 from .calls import RefusedError, address_of, explained, read_answer, trusting
 from .engine_gate import EngineGate
-from .machine import address_towards, ask_engine, describe
+from .machine import ask_engine, describe, own_address
+from .names import Names
 from .store import NodeError, NodeStore, new_key, renew_due, request_for
 
 log = logging.getLogger(__name__)
@@ -90,6 +92,8 @@ class NodeProgram:
         self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices, config.registries)
         self._on_linked = on_linked
         self._links: dict[str, asyncio.Task[None]] = {}
+        self._linked: set[str] = set()
+        self._names = Names(_MOST_URLS)
         self._told: dict[str, str] = {}
         self._renewed_at = -_RENEW_AGAIN_S
         self._renewing = asyncio.Lock()
@@ -110,6 +114,7 @@ class NodeProgram:
                     link.cancel()
             log.info("this machine is no site any more")
         finally:
+            self._names.close()
             await closed()
 
     def _is_joined(self) -> bool:
@@ -122,14 +127,25 @@ class NodeProgram:
     def _learn(self, urls: tuple[str, ...]) -> None:
         """Link with those that are new, and keep them."""
         for url in urls:
-            if url not in self._links and len(self._links) < _MOST_URLS:
+            if url in self._links:
+                continue
+            if len(self._links) >= _MOST_URLS:
+                self._forget_one((self._config.urls[0], *self._linked, *urls))
+            if len(self._links) < _MOST_URLS:
                 with contextlib.suppress(NodeError):
                     address_of(url)
                     self._links[url] = self._group.create_task(self._keep(url))
-        if new := tuple(url for url in self._links if url not in self._config.urls):
-            self._config = self._config.model_copy(update={"urls": (*self._config.urls, *new)})
+        if (known := tuple(self._links)) != self._config.urls:
+            self._config = self._config.model_copy(update={"urls": known})
             with contextlib.suppress(OSError):  # it is told again
                 self._store.save(self._config)
+
+    def _forget_one(self, but: Collection[str]) -> None:
+        """One that is not linked, and of which nobody says any more that it is there; never by which it joined."""
+        for url in self._links:
+            if url not in but:
+                self._links.pop(url).cancel()
+                return
 
     async def _keep(self, url: str) -> None:
         wait = AGAIN_S
@@ -156,12 +172,18 @@ class NodeProgram:
 
     # One link
 
-    async def _open(self, url: str, request: Strict) -> Stream:
-        host, port = address_of(url)
-        writer: asyncio.StreamWriter | None = None
+    async def _find(self, url: str) -> list[str]:
         try:
             async with asyncio.timeout(ANSWER_S):
-                reader, writer = await asyncio.open_connection(host, port, limit=MOST_LINE)
+                return await self._names.find(address_of(url)[0])
+        except OSError as error:
+            raise explained(url, error) from error
+
+    async def _open(self, url: str, addresses: Iterable[str], request: Strict) -> Stream:
+        port, writer = address_of(url)[1], None
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                reader, writer = await _connected(addresses, port)
                 keep_alive(writer.get_extra_info("socket"))
                 await writer.start_tls(self._trust, server_hostname=SERVER_NAME)
         except BaseException as error:
@@ -175,8 +197,9 @@ class NodeProgram:
 
     async def _link(self, url: str) -> None:
         machine = await asyncio.to_thread(self._describe)
-        address = await asyncio.to_thread(address_towards, url) if self._config.follow else None
-        reader, writer = await self._open(url, Link(machine=machine, address=address))
+        found = await self._find(url)
+        address = own_address(found[0], address_of(url)[1]) if self._config.follow else None
+        reader, writer = await self._open(url, found, Link(machine=machine, address=address))
         try:
             async with asyncio.timeout(ANSWER_S):
                 line = await reader.readuntil(b"\n")
@@ -190,11 +213,15 @@ class NodeProgram:
             self._told.pop(url, None)
             log.info("linked with %s", url)
             self._on_linked(url)
+            self._linked.add(url)
             self._learn(linked.urls)
-            await self._both(self._receive(url, reader, writer, linked.link), self._monitor(url, writer, linked))
+            there = str(writer.get_extra_info("peername")[0])
+            ways = partial(self._way, url, there, writer, linked.link)
+            await self._both(self._receive(reader, writer, ways), self._monitor(url, writer, linked))
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValidationError) as error:
             raise NodeError(f"the link to {url} ended: {str(error) or type(error).__name__}") from error
         finally:
+            self._linked.discard(url)
             writer.transport.abort()
 
     async def _both(self, *works: Coroutine[Any, Any, None]) -> None:
@@ -216,7 +243,12 @@ class NodeProgram:
             engine = None
         return describe(engine, self._config.echo)
 
-    async def _receive(self, url: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, link: str) -> None:
+    async def _receive(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        open_way: Callable[[], Coroutine[Any, Any, None]],
+    ) -> None:
         """Do what the orchestrator says until it says nothing more."""
         ways: set[asyncio.Task[None]] = set()
         try:
@@ -227,7 +259,7 @@ class NodeProgram:
                 if told.ping is not None:
                     writer.write(line_of(Said(pong=told.ping)))
                 for _ in range(min(told.open or 0, MOST_WAYS - len(ways))):
-                    way = asyncio.create_task(self._way(url, writer, link))
+                    way = asyncio.create_task(open_way())
                     ways.add(way)
                     way.add_done_callback(ways.discard)
                 async with asyncio.timeout(SILENT_S):  # whoever asks, and takes no answer, is not heard on
@@ -297,10 +329,10 @@ class NodeProgram:
 
     # Ways
 
-    async def _way(self, url: str, told: asyncio.StreamWriter, link: str) -> None:
+    async def _way(self, url: str, there: str, told: asyncio.StreamWriter, link: str) -> None:
         """One connection for somebody who asks the engine from there."""
         try:
-            reader, writer = await self._open(url, Way(link=link))
+            reader, writer = await self._open(url, (there,), Way(link=link))
         except NodeError:
             told.write(line_of(Said(failed=1)))
             return
@@ -321,6 +353,17 @@ class NodeProgram:
             pass  # whoever asked sees the connection end
         finally:
             writer.transport.abort()
+
+
+async def _connected(addresses: Iterable[str], port: int) -> Stream:
+    """With the first of them that answers."""
+    failed = OSError("it has no address")
+    for address in addresses:
+        try:
+            return await asyncio.open_connection(address, port, limit=MOST_LINE)
+        except OSError as error:
+            failed = error
+    raise failed
 
 
 def _allow_connections() -> None:

@@ -1,0 +1,40 @@
+"""Where orchestrators are. A name that takes long to be resolved holds up nobody but whoever asks for it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from concurrent.futures import Future, ThreadPoolExecutor
+
+
+class Names:
+    """Resolves names, in threads of its own: for what an engine is asked there are few.
+
+    Args:
+        most: Names that are resolved at a time.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._threads = ThreadPoolExecutor(most, thread_name_prefix="names")
+        self._asked: dict[str, Future[list[str]]] = {}
+
+    async def find(self, host: str) -> list[str]:
+        """Addresses of a name; of one it is asked once at a time, whoever waits no more.
+
+        Raises:
+            OSError: It has none.
+        """
+        asked = self._asked.get(host)
+        if asked is None or asked.done():
+            self._asked = {name: one for name, one in self._asked.items() if not one.done()}
+            asked = self._asked[host] = self._threads.submit(_addresses, host)
+        return await asyncio.shield(asyncio.wrap_future(asked))
+
+    def close(self) -> None:
+        """Ask for nothing more."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+def _addresses(host: str) -> list[str]:
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    return list(dict.fromkeys(str(row[4][0]) for row in found))
