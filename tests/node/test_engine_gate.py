@@ -9,6 +9,7 @@ import gzip
 import io
 import json
 import os
+import re
 import socket
 import socketserver
 import tarfile
@@ -29,7 +30,6 @@ from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
-from skytether.node.registries import registry_of
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.docker.reports import unpacked
 
@@ -107,7 +107,10 @@ class Engine:
                 if "/images/" in self.path and self.command == "GET":
                     said = {"RepoDigests": engine.digests}
                 text = json.dumps(said).encode()
-                missing = self.path.startswith("/images/new") or (engine.emptied and self.command in ("HEAD", "DELETE"))
+                if self.path.startswith("/distribution/"):
+                    text = json.dumps({"Descriptor": {"digest": f"sha256:{ID}"}}).encode()
+                new = re.match("/images/(docker.io/)?new", self.path)
+                missing = new or (engine.emptied and self.command in ("HEAD", "DELETE"))
                 if self.path.startswith("/networks?"):
                     text = json.dumps([{"Name": name} for name in engine.networks]).encode()
                 if self.path.startswith("/containers/json"):
@@ -218,8 +221,9 @@ def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine
     body = b' {"Memory": 1, "Memory": 2}'
     sent = request("GET /v1.41/info") + request(f"POST /v1.41/containers/{ID}/update", body, *odd)
     assert say(engine, sent).count(b"HTTP/1.1 200") == 2
-    looked = f"GET /containers/{ID}/json"
-    assert sorted(engine.lines[:-1]) == [looked, "GET /v1.41/info"]  # which of them first, the engine's threads say
+    looked = {f"GET /containers/{ID}/json", "GET /v1.41/info"}
+    asked = [line for line in engine.lines[:-1] if "/containers/json?" not in line]  # what runs already
+    assert sorted(asked) == sorted(looked)  # which of them first, the engine's threads say
     assert engine.lines[-1] == f"POST /v1.41/containers/{ID}/update"
     _, headers, got = engine.asked[-1]
     assert {name.lower() for name in headers} == {"accept-encoding", "host", "content-length", "content-type"}
@@ -312,7 +316,7 @@ def test_of_a_network_no_container_is_told(engine: Engine) -> None:
     ("path", "kind"),
     [
         ("/containers/prune?filters=%7B%22label%22%3A+%5B%22skytether.io%2Fguard%22%5D%7D", "x-www-form-urlencoded"),
-        ("/images/create?fromImage=new&tag=1", "x-www-form-urlencoded"),
+        (f"/images/create?fromImage=new&tag=sha256%3A{ID}", "x-www-form-urlencoded"),
     ],
 )
 def test_no_form_says_what_the_query_does_not(engine: Engine, path: str, kind: str) -> None:
@@ -535,27 +539,20 @@ def test_no_pull_has_the_engine_ask_this_machine(engine: Engine, image: str, tag
     assert engine.lines == []
 
 
-@pytest.mark.parametrize(
-    ("image", "digests", "good"),
-    [
-        ("new", [], True),
-        ("docker.io/library/debian", ["debian@sha256:aa"], True),
-        ("registry.example:5000/a/b", ["other@sha256:aa", "registry.example:5000/a/b@sha256:aa"], True),
-        ("somebody/app", [], False),  # made on this machine
-        ("somebody/app", ["debian@sha256:aa"], False),
-        ("registry.example/debian", ["debian@sha256:aa"], False),
-    ],
-)
-def test_no_pull_takes_the_name_of_an_image_that_is_from_elsewhere(
-    engine: Engine, image: str, digests: list[str], good: bool
-) -> None:
+def test_what_is_pulled_by_a_name_gets_that_name_at_no_engine(engine: Engine) -> None:
     """Whoever starts something by that name on this machine, with whatever rights, would start what was pulled."""
-    engine.digests = digests
-    asked = request(f"POST /images/create?fromImage={quote(image, safe='')}&tag=1")
-    got = say(engine, asked, (registry_of(image),))
-    assert (b"200 OK" in got) is good
-    assert good or b"of this machine was not pulled from there" in got
-    assert any(line.startswith("POST") for line in engine.lines) is good
+    pull = request("POST /v1.41/images/create?fromImage=docker.io%2Fnew&tag=1", b"", "X-Registry-Auth: e30=")
+    assert b"200 OK" in say(engine, pull, ("docker.io",))
+    assert engine.lines[-2:] == [
+        "GET /distribution/docker.io/new:1/json",
+        f"POST /v1.41/images/create?fromImage=docker.io%2Fnew&tag=sha256%3A{ID}",
+    ]
+    assert {
+        headers.get("X-Registry-Auth") or headers.get("x-registry-auth") for _, headers, _ in engine.asked[-2:]
+    } == {"e30="}
+    engine.digests = ["docker.io/own@sha256:aa"]
+    own = request("POST /v1.41/images/create?fromImage=docker.io%2Fown&tag=1")
+    assert b"docker.io/own:1 is this machine's own" in say(engine, own, ("docker.io",))
 
 
 MOUNTED = [
@@ -814,9 +811,35 @@ def test_a_container_that_no_engine_lets_go_of_holds_up_nobody_else(
         await asyncio.wait_for(site.start(Y), 5.0)
         await asyncio.sleep(0.3)
         assert unpause not in engine.lines, "while another one is just joining its network"
+        kill = f"POST /v1.41/containers/{X}/kill?signal=KILL"
+        assert b"another container is just joining its network" in await site.ask(kill)
         engine.slow[hangs].set()
         await site.soon(unpause)
         engine.slow[unpause].set()
+        async with asyncio.timeout(10):
+            while b"200 OK" not in await site.ask(kill):
+                await asyncio.sleep(0.01)
+
+    asyncio.run(run())
+
+
+def test_a_program_that_was_just_started_has_nobody_ended_whose_network_another_one_joins(engine: Engine) -> None:
+    """Its network was then looked up by the number of a process that had ended: another one could have that by then."""
+    joins = {"HostConfig": {"ReadonlyRootfs": True, "NetworkMode": f"container:{X}"}, "Mounts": []}
+    engine.running, engine.paused, engine.others = {X, Z}, {X}, {X: in_volumes("skytether-s"), Z: joins}
+    engine.slow = {f"POST /containers/{X}/unpause": threading.Event()}
+
+    async def run() -> None:
+        site = Site(engine)
+        for line in (
+            f"POST /v1.41/containers/{X}/kill?signal=KILL",
+            f"DELETE /v1.41/containers/{X}?force=1",
+        ):
+            assert b"another container is just joining its network" in await site.ask(line)
+        engine.slow[f"POST /containers/{X}/unpause"].set()
+        async with asyncio.timeout(10):
+            while b"200 OK" not in await site.ask(f"POST /v1.41/containers/{X}/kill?signal=KILL"):
+                await asyncio.sleep(0.01)
 
     asyncio.run(run())
 

@@ -42,14 +42,16 @@ from .engine_rules import (
 )
 from .files import Files
 from .machine import ANYWHERE, Answer, free_port, is_taken, listed
+from .pulls import AUTH, Pulls
 from .registries import Registries
 from .removals import BusyError, Removals
+from .store import NodeStore
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 _LINE = re.compile(rb"([A-Z]{3,7}) (/[!-~]{0,8000}) HTTP/1\.1")
-_PASSED = (b"accept", b"x-registry-auth")
+_PASSED = (b"accept", AUTH)
 """Headers that the engine gets as they are. The type of what is sent is told by us: an engine reads a form, too, and
 believes it before the query."""
 _MOST_JSON, _MOST_ARCHIVE = 1 << 18, 2 << 20
@@ -78,7 +80,7 @@ _MADE_S, _MOST_NETWORKS = 60.0, 12
 take them all has addresses that the machine knows elsewhere."""
 _MOST_DESCRIBED = 64 << 10
 """Bytes of what an engine says of one container."""
-_MAKES = ("/containers/create", "/volumes/create")
+_MAKES, _PULL = ("/containers/create", "/volumes/create"), "/images/create"
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0
@@ -89,16 +91,22 @@ _WEIGHED, _OWNED, _SIZE = ("Volumes.item", "VolumeUsage.Items.item"), f"Labels.{
 class EngineGate:
     """Judges what is asked of one engine."""
 
-    def __init__(self, engine: str, devices: tuple[str, ...] = (), registries: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        engine: str,
+        devices: tuple[str, ...] = (),
+        registries: tuple[str, ...] = (),
+        store: NodeStore | None = None,
+    ) -> None:
         """Judge by what was said as the machine joined.
 
         Args:
             engine: Path of its socket.
             devices: Files of devices that containers may have.
             registries: See `Registries`.
+            store: Where it is kept what orchestrators call images; None: nowhere.
         """
         self._engine = engine
-        self._registries = Registries(registries)
         self._devices = devices
         self._ours: set[str] = set()
         self._removals = Removals(engine)
@@ -109,6 +117,8 @@ class EngineGate:
         asking = Asking(engine)
         self._ask, self._asked = asking.ask, asking.asked
         self._files = Files(engine, asking)
+        names, keep = (store.names(), store.save_names) if store else ({}, lambda _: None)
+        self._pulls = Pulls(asking, Registries(registries), names, keep)
 
     async def pass_requests(self, asks: Stream, engine: Stream) -> None:
         """Until the one who asks has ended, or was refused something."""
@@ -166,6 +176,9 @@ class EngineGate:
                 if made is None:
                     raise RefusedCall("its archive has something else than folders of ours and a grant")
                 body = made
+            if plain(call.path) == _PULL:
+                query["tag"] = await self._pulls.digest_of(query["fromImage"], query["tag"], headers)
+            path = await self._pulls.path_of(path)
             target = path + (f"?{urlencode(query)}" if query else "")
             if answered := self._answered(call, path, target, body if archive else b""):
                 await _answer(back, *await answered)
@@ -224,10 +237,7 @@ class EngineGate:
             raise RefusedCall(refused)
         for subject in subjects:
             if subject[0] == "pulled":
-                if odd := await self._registries.refusal(subject[1]):
-                    raise RefusedCall(odd)
-            elif subject[0] == "images":
-                await self._may_be_pulled(subject[1])
+                await self._pulls.may_come_from(subject[1])
             elif subject[0] == "guarded":
                 await self._may_be_guarded(subject[1])
             elif not await self._is_ours(subject):
@@ -238,14 +248,6 @@ class EngineGate:
             await self._tried(self._removals.look_back())
         elif plain(call.path).endswith("/connect"):
             _may_be_published((await self._asked(f"/containers/{subjects[0][1]}/json"))[1])
-
-    async def _may_be_pulled(self, image: str) -> None:
-        """Raises if something else of this machine has that name: who starts it by that name would start ours."""
-        status, found = await self._asked(f"/images/{image}/json")
-        digests = found.get("RepoDigests") if isinstance(found, dict) else None
-        known = {_familiar(str(one).partition("@")[0]) for one in digests or ()}
-        if status != HTTPStatus.NOT_FOUND and _familiar(image.rpartition(":")[0]) not in known:
-            raise RefusedCall(f"the image {image[:80]} of this machine was not pulled from there")
 
     async def _may_be_guarded(self, container: str) -> None:
         """Raises unless the network that it is made in is ours, and it is connected to no other but ours after that.
@@ -402,8 +404,3 @@ def _header(row: bytes) -> tuple[bytes, bytes]:
     if not colon or not re.fullmatch(rb"[A-Za-z-]+", name) or not re.fullmatch(rb"[\t -~]*", value):
         raise RefusedCall("it is no plain request")
     return name.lower(), value.strip()
-
-
-def _familiar(image: str) -> str:
-    """A name as an engine shortens it."""
-    return re.sub(r"^(?:(?:index\.)?docker\.io/)?(?:library/)?", "", image)

@@ -92,7 +92,7 @@ LOOK = f"{_OURS}look-"
 """What names begin with of containers that the node makes itself, to look at an image; 8 hexadecimal digits follow."""
 _BRIDGE = "skt-[0-9A-Za-z]{1,11}"
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
-_TAG, _DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
+_TAG, DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
 FOLDER, DATA = "/run/skytether", "/var/lib/skytether"
 """In containers: what is put into the first is for the service, and what it says of itself is in files in there; in the
 second a folder is put for what it writes."""
@@ -219,10 +219,8 @@ def _joined(network: str, body: Mapping[str, Any]) -> _Judgement:
 
 def _pulled(call: Call) -> _Judgement:
     image, tag = call.query.get("fromImage", ""), call.query.get("tag", "")
-    if re.fullmatch(_IMAGE, image) and re.fullmatch(_DIGEST, tag):
-        return None, (("pulled", image),)  # by that nothing gets another name
-    odd = None if re.fullmatch(_IMAGE, image) and re.fullmatch(_TAG, tag) else "a pull names one image"
-    return odd, (("pulled", image), ("images", f"{image}:{tag}"))
+    good = re.fullmatch(_IMAGE, image) and (re.fullmatch(DIGEST, tag) or re.fullmatch(_TAG, tag))
+    return None if good else "a pull names one image", (("pulled", image),)
 
 
 def _pruned(call: Call) -> str | None:

@@ -120,7 +120,14 @@ def ask_json(path: str, what: str) -> tuple[int, Any]:
 
 
 def ask(
-    path: str, what: str, *, method: str = "GET", body: Any = None, patience: float = _ENGINE_S, most: int = _MOST
+    path: str,
+    what: str,
+    *,
+    method: str = "GET",
+    body: Any = None,
+    headers: Mapping[str, str] | None = None,
+    patience: float = _ENGINE_S,
+    most: int = _MOST,
 ) -> Answer:
     """One call.
 
@@ -129,6 +136,7 @@ def ask(
         what: Path and query.
         method: As HTTP names it.
         body: Sent as JSON, unless it is None.
+        headers: More of them.
         patience: Seconds for each step of it.
         most: Bytes of the answer, which is cut off there.
 
@@ -136,16 +144,19 @@ def ask(
         OSError: It does not answer.
         ValueError: It answers something else.
     """
-    with _answered(path, what, method, body, patience) as answer:
+    with _answered(path, what, method, body, headers or {}, patience) as answer:
         return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
 
 
 @contextlib.contextmanager
-def _answered(path: str, what: str, method: str, body: Any, patience: float) -> Iterator[http.client.HTTPResponse]:
+def _answered(
+    path: str, what: str, method: str, body: Any, headers: Mapping[str, str], patience: float
+) -> Iterator[http.client.HTTPResponse]:
     connection = _Connection(path, patience)
     try:
         text = None if body is None else json.dumps(body)
-        connection.request(method, what, text, {"Content-Type": "application/json"} if text else {})
+        kind = {"Content-Type": "application/json"} if text else {}
+        connection.request(method, what, text, {**headers, **kind})
         yield connection.getresponse()
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
@@ -172,7 +183,7 @@ def listed(
     """
     found: list[dict[str, Any]] = []
     start, until = "", time.monotonic() + _LIST_S
-    with _answered(path, what, "GET", None, patience) as answer:
+    with _answered(path, what, "GET", None, {}, patience) as answer:
         if answer.status != http.HTTPStatus.OK:
             raise ValueError(f"it answers {answer.status}")
         try:

@@ -46,6 +46,10 @@ _VOLUME = "volume "
 """What volumes are known by, before their names: they may be named as containers are."""
 
 
+_GOING: set[asyncio.Task[Any]] = set()
+"""A loop itself keeps no task that waits: it would be thrown away, if nobody else knows it."""
+
+
 class BusyError(Exception):
     """It is not done now; in a sentence."""
 
@@ -129,9 +133,12 @@ class Removals:
                 finally:
                     await self._go_on(joined)
         finally:
-            self._joined[joined] -= 1
-            if not self._joined[joined]:
-                del self._joined[joined], self._pauses[joined]
+            self._has_joined(joined)
+
+    def _has_joined(self, joined: str) -> None:
+        self._joined[joined] -= 1
+        if not self._joined[joined]:
+            del self._joined[joined], self._pauses[joined]
 
     async def _go_on(self, container: str) -> None:
         for wait_s in _GO_ON_S:
@@ -144,6 +151,7 @@ class Removals:
 
     async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
         """Have something done by which a container may end, which it must not while another one joins its network."""
+        await self.look_back()
         if container in self._joined:
             raise BusyError("another container is just joining its network")
         self._ending[container] += 1
@@ -281,6 +289,7 @@ class Removals:
                     if there[paused].get("State") != "paused":
                         continue
                     joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
+                    self._joined[paused] += 1
                     begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
@@ -290,13 +299,14 @@ class Removals:
 
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
         """An earlier program may have ended while it had it paused, for others that joined its network."""
-        async with self._pauses.setdefault(container, asyncio.Lock()):
-            for one in joining:
-                while not await self._is_settled(one):
-                    await asyncio.sleep(_SETTLED_S)
-            await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
-        if container not in self._joined:
-            self._pauses.pop(container, None)
+        try:
+            async with self._pauses.setdefault(container, asyncio.Lock()):
+                for one in joining:
+                    while not await self._is_settled(one):
+                        await asyncio.sleep(_SETTLED_S)
+                await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+        finally:
+            self._has_joined(container)
 
     async def _running(self, things: Iterable[str]) -> set[str]:
         """Those of these containers that run, or may."""
@@ -352,6 +362,8 @@ class Removals:
 def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
     """A task that goes on whoever waits for it, and whose failure need not be read."""
     task = asyncio.create_task(work)
+    _GOING.add(task)
+    task.add_done_callback(_GOING.discard)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
     return task
 

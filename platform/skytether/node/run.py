@@ -89,7 +89,7 @@ class NodeProgram:
         self._authority = store.authority()
         self._trust: ssl.SSLContext = trusting(self._authority, store.identity)
         config = self._config
-        self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices, config.registries)
+        self._gate = None if config.unfiltered else EngineGate(config.engine, config.devices, config.registries, store)
         self._on_linked = on_linked
         self._links: dict[str, asyncio.Task[None]] = {}
         self._linked: set[str] = set()

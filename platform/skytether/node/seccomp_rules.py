@@ -30,6 +30,8 @@ _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "val
 """Arguments of sockets of AF_NETLINK, that for netfilter."""
 _NEEDED = {"close", "close_range", "execve", "exit_group", "futex", "mmap", "openat", "read", "write"}
 """What runc calls by a container's profile before it is that container. Without one, it may never end, nor start."""
+_MOST_ERRNO = 4096
+"""Of the kernel."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
 _ARGUMENT = {"index", "value", "valueTwo", "op"}
 _ENTRY = {"names", "name", "action", "errnoRet", "args", "comment", "includes", "excludes"}
@@ -93,8 +95,8 @@ def _named(entry: Mapping[str, Any]) -> set[Any]:
 
 
 def _is_error(number: Any) -> bool:
-    """By zero a call that was not made seems to have gone well."""
-    return number is None or (type(number) is int and number > 0)
+    """By zero a call that was not made seems to have gone well; runc keeps 16 bits of it."""
+    return number is None or (type(number) is int and 0 < number < _MOST_ERRNO)
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

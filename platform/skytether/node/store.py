@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from pydantic import Field, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from skytether.api.manifest import Device, Name, Strict
 from skytether.api.node import Address, Port
@@ -19,7 +21,7 @@ from skytether.guard.folder import objection
 from .proof import identity, unfit
 
 DEFAULT_FOLDER = Path("/etc/skytether/node")
-_CONFIG, _AUTHORITY, _IDENTITY = "node.json", "authority.pem", "identity.pem"
+_CONFIG, _AUTHORITY, _IDENTITY, _NAMES = "node.json", "authority.pem", "identity.pem", "images.json"
 
 
 class NodeError(Exception):
@@ -144,9 +146,19 @@ class NodeStore:
             )
         self._put(_IDENTITY, identity(key, x509.load_pem_x509_certificate(certificate.encode())))
 
+    def names(self) -> dict[str, list[str]]:
+        """Digests of images by the names that orchestrators pulled them by; of a damaged file none."""
+        try:
+            return TypeAdapter(dict[str, list[str]]).validate_json((self.folder / _NAMES).read_bytes())
+        except (OSError, ValueError):
+            return {}
+
+    def save_names(self, names: Mapping[str, list[str]]) -> None:
+        self._put(_NAMES, json.dumps(names, indent=1).encode() + b"\n")
+
     def clear(self) -> None:
         """Forget all of it."""
-        for name in (_CONFIG, _IDENTITY, _AUTHORITY):
+        for name in (_CONFIG, _IDENTITY, _AUTHORITY, _NAMES):
             (self.folder / name).unlink(missing_ok=True)
         if self.folder.is_dir() and not any(self.folder.iterdir()):
             self.folder.rmdir()

@@ -16,6 +16,7 @@ import pytest
 from docker.errors import APIError
 from docker_site import DockerSite
 from node_scene import NodeScene, program, until
+from registry_server import registry
 
 from skytether.api.client import Client
 from skytether.api.rest import InstanceCreate, Invite, State
@@ -78,6 +79,46 @@ def test_what_runs_at_a_node_that_is_unplugged_runs_on_and_is_found_again(
         # By way of the node what is left there goes with the site.
         assert house.operator.delete_site("edge")
         assert docker_site.containers() == docker_site.helpers() == []
+
+
+def test_what_is_pulled_by_a_name_gets_that_name_at_no_engine(
+    house: NodeScene, docker_site: DockerSite, registry_program: str, tmp_path: Path, manifest: Callable[..., Any]
+) -> None:
+    """Nor does a name that somebody on the machine gave mean another image, when the registry has one by it."""
+    options = {key: value for key, value in docker_site.options().items() if key not in ("engine", "pull")}
+    with registry(registry_program, tmp_path) as host:
+        name = f"{host}/toy:1"
+        docker_site.docker("tag", docker_site.images.toy, name)
+        docker_site.docker("push", "-q", name)
+        docker_site.docker("rmi", name)
+        token = house.operator.invite(Invite(name="edge", options=options)).token
+        joined = join(house.options(token, engine=ENGINE, registries=(host,)))
+        assert joined.stands.state == "ready", joined.stands.reason
+        house.operator.put_service("toy", manifest(entrypoint=None, image=name))
+        with program(house.store()) as linked:
+            until(lambda: linked and house.state() == "ready")
+            for _ in range(2):  # pulled, and there already
+                made = house.operator.create_instance(InstanceCreate(robot="walker", service="toy", lease_s=1000))
+                house.operator.wait_running(made.id)
+                house.operator.delete_instance(made.id)
+                until(lambda: not house.operator.get_site("edge").instances)
+            assert docker_site.docker("images", "-q", name) == "", "it has no name there"
+            (digest,) = house.store().names()[name]
+            docker_site.docker("tag", docker_site.images.name("base"), name)
+            way = f"unix://{house.core.settings.state_dir}/sites/edge/engine.sock"
+            client = Engine(way, version="1.41", timeout=30)
+            try:
+                own = docker_site.docker("inspect", "-f", "{{.Id}}", name)
+                assert client.inspect_image(name)["Id"] == own
+                with pytest.raises(APIError, match="is this machine's own"):
+                    client.pull(name)
+                assert client.inspect_image(f"{host}/toy@{digest}")["Id"] != own
+                with pytest.raises(APIError, match="manifest unknown"):
+                    client.pull(f"{host}/toy:2")
+            finally:
+                client.close()
+                docker_site.docker("rmi", name, f"{host}/toy@{digest}")
+            assert house.operator.delete_site("edge")
 
 
 def refuses_to_be_had(house: NodeScene, docker_site: DockerSite, ours: str) -> None:
