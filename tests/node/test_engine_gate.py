@@ -118,9 +118,9 @@ class Engine:
                     text = json.dumps(
                         [
                             {
+                                **engine.others.get(one, {}),
                                 "Id": one,
                                 "State": "paused" if one in engine.paused else "running",
-                                "HostConfig": engine.others.get(one, {}).get("HostConfig"),
                             }
                             for one in there
                         ]
@@ -840,6 +840,22 @@ def test_a_program_that_was_just_started_has_nobody_ended_whose_network_another_
         async with asyncio.timeout(10):
             while b"200 OK" not in await site.ask(f"POST /v1.41/containers/{X}/kill?signal=KILL"):
                 await asyncio.sleep(0.01)
+
+    asyncio.run(run())
+
+
+def test_what_an_earlier_program_made_to_look_at_an_image_is_removed(engine: Engine) -> None:
+    """Whoever had the node's program ended again and again, had these pile up, and nobody else may remove them."""
+    look = {"Names": [f"/skytether-look-{'0' * 8}"], "Labels": {"skytether.io/owner": "-"}}
+    engine.idle = {X, Y, Z}
+    engine.others = {X: {**look, "Created": 1}, Y: {**look, "Created": 1 << 40}, Z: {**look, "Labels": {}}}
+    engine.others[OTHER] = in_volumes("skytether-s")
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(OTHER)
+        await site.soon(f"DELETE /containers/{X}?force=1&v=1")
+        assert not [line for line in engine.lines if line.startswith("DELETE") and (Y in line or Z in line)]
 
     asyncio.run(run())
 

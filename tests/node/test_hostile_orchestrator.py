@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import resource
 import socket
@@ -166,7 +167,15 @@ def odd_certificate(keys: Path, key: ec.EllipticCurvePrivateKey, odd: str) -> st
     if odd == "with what nobody knows":
         unknown = x509.UnrecognizedExtension(x509.ObjectIdentifier("1.3.6.1.4.1.99999.1"), b"\5\0")
         builder = builder.add_extension(unknown, critical=True)
-    return pem_of(builder.sign(signer, hashes.SHA3_256() if odd == "signed oddly" else hashes.SHA256()))
+    made = builder.sign(signer, hashes.SHA3_256() if odd == "signed oddly" else hashes.SHA256())
+    if odd != "of no version":
+        return pem_of(made)
+    tbs = made.tbs_certificate_bytes.replace(b"\xa0\3\2\1\2", b"\xa0\3\2\1\x22", 1)
+    signed = b"\0" + signer.sign(tbs, ec.ECDSA(hashes.SHA256()))
+    kind = bytes.fromhex("300a06082a8648ce3d040302")  # ecdsa-with-SHA256
+    inner = tbs + kind + bytes([3, len(signed)]) + signed
+    whole = b"\x30\x82" + len(inner).to_bytes(2, "big") + inner
+    return f"-----BEGIN CERTIFICATE-----\n{base64.encodebytes(whole).decode()}-----END CERTIFICATE-----\n"
 
 
 @pytest.mark.parametrize(
@@ -178,6 +187,7 @@ def odd_certificate(keys: Path, key: ec.EllipticCurvePrivateKey, odd: str) -> st
         ("by another authority", "InvalidSignature"),
         ("signed oddly", "[SSL"),
         ("for servers", "unsuitable certificate purpose"),
+        ("of no version", "is not a valid X509 version"),
         ("of another name", "it is for another name"),
         ("of two names", "it is for another name"),
         ("over long ago", "it is over already"),
@@ -208,6 +218,22 @@ def test_what_is_no_certificate_of_the_node_takes_its_own_from_nobody(
     run.NodeProgram(hostile.store)  # which it could not be any more
     hostile.store.renew(key, hostile.issue(key))
     assert hostile.store.identity.read_bytes() != before
+
+
+def test_what_nobody_expects_of_one_link_ends_no_other(hostile: Hostile, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By one answer of a replica that was taken over the node's program ended, and again after each start."""
+    links = iter(range(100))
+
+    def read(*_: Any) -> Any:
+        if next(links) == 0:
+            raise ArithmeticError
+        raise NodeError("no")
+
+    monkeypatch.setattr(run, "read_answer", read)
+    monkeypatch.setattr(run, "_AGAIN_MOST_S", 0.05)
+    hostile.answers[Link] = lambda link: link.sendall(hostile.linked())
+    with program(hostile.store):
+        until(lambda: next(links) > 2)
 
 
 @pytest.mark.parametrize("left", ["left", "left, and joined another"])

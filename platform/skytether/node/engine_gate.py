@@ -158,7 +158,8 @@ class EngineGate:
         method, (path, _, asked) = line[1].decode(), line[2].decode().partition("?")
         pairs = parse_qsl(asked, keep_blank_values=True)
         query, length = dict(pairs), headers.get(b"content-length", b"0")
-        archive, most = method == "PUT", _MOST_ARCHIVE if method == "PUT" else _MOST_JSON
+        archive = method == "PUT"
+        most = _MOST_ARCHIVE if archive else _MOST_JSON if plain(path) == _MAKES[0] else _LARGE
         if len(query) != len(pairs) or not length.isdigit() or len(length) > _MOST_DIGITS or int(length) > most:
             raise RefusedCall("its query or its length is odd")
         async with self._large if int(length) > _LARGE else contextlib.nullcontext():

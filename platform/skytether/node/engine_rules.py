@@ -90,6 +90,8 @@ By any other name, somebody else on this machine could have ours for his own: it
 ids, and by name where a container starts."""
 LOOK = f"{_OURS}look-"
 """What names begin with of containers that the node makes itself, to look at an image; 8 hexadecimal digits follow."""
+LOOKS = re.compile(f"/{LOOK}[0-9a-f]{{8}}")
+"""Such a name, as an engine says it."""
 _BRIDGE = "skt-[0-9A-Za-z]{1,11}"
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9.-]*(?::\d+(?=/))?(?:/[A-Za-z0-9_][A-Za-z0-9_.-]*)*"
 _TAG, DIGEST = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}", "sha256:[0-9a-f]{64}"
@@ -198,7 +200,7 @@ def _created(call: Call, devices: Iterable[str]) -> _Judgement:
     volumes = [one.get("Source") for one in _list(host, "Mounts") if isinstance(one, dict)]
     name = call.query.get("name", _OURS)
     odd = None if name.startswith(_OURS) else f"it is named '{name[:80]}', and ours begin with {_OURS}"
-    if re.fullmatch(f"{LOOK}[0-9a-f]{{8}}", name):
+    if LOOKS.fullmatch(f"/{name}"):
         # With one by that name that no engine ends, the node looked at no image any more, whoever's it is.
         odd = f"it is named '{name}', as what the node makes itself"
     return odd or _container(call.body, set(devices)), (

@@ -16,10 +16,11 @@ import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
 from http import HTTPStatus
+from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
-from .engine_rules import OWNER
+from .engine_rules import LOOKS, NOBODY, OWNER
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask, ask_long, lean, listed, picked
 
@@ -69,7 +70,7 @@ class Removals:
         self._engine = engine
         self._kin = Kin()
         self._looking = asyncio.Lock()
-        self._looked_back = False
+        self._looked_back, self._began = False, time.time()
         self._starts: dict[str, asyncio.Task[Answer]] = {}
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
@@ -283,7 +284,7 @@ class Removals:
             return
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
-            there = {one["Id"]: one for one in await self._containers()}
+            there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
             if old := {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}:
                 for paused in old:
                     if there[paused].get("State") != "paused":
@@ -296,6 +297,14 @@ class Removals:
         except TooMuchError:
             self._kin.lose()
         self._looked_back = True
+
+    def _is_left(self, container: Mapping[str, Any]) -> bool:
+        """Whether an earlier program made it to look at an image, and had no time to remove it; then it is removed."""
+        name, made = str(container.get("Names.item")), float(container.get("Created") or inf)
+        left = container.get(f"Labels.{OWNER}") == NOBODY and LOOKS.fullmatch(name) and made < self._began
+        if left:
+            begun(ask_long(self._engine, f"/containers/{container['Id']}?force=1&v=1", method="DELETE"))
+        return bool(left)
 
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
         """An earlier program may have ended while it had it paused, for others that joined its network."""
@@ -355,7 +364,7 @@ class Removals:
 
     async def _containers(self) -> list[dict[str, Any]]:
         """All of orchestrators."""
-        keys = ("Id", "State", _MODE)
+        keys = ("Id", "State", _MODE, "Names.item", f"Labels.{OWNER}", "Created")
         return await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
 
 

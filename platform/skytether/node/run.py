@@ -161,6 +161,9 @@ class NodeProgram:
             except NodeError as error:
                 self._warn_once(url, str(error))
                 pause = wait
+            except Exception:  # whatever one of them says ends no other's link
+                log.exception("the link to %s ended", printable(url, lines=False))
+                pause = _AGAIN_MOST_S
             wait = AGAIN_S if time.monotonic() - began > _AGAIN_MOST_S else min(_AGAIN_MOST_S, 2 * wait)
             await asyncio.sleep(pause * random.uniform(2 / 3, 1))
 
