@@ -6,7 +6,7 @@ import asyncio
 from http import HTTPStatus
 from typing import Any
 
-from .machine import Answer, ask, lean
+from .machine import Answer, ask, ask_long, lean
 
 JSON, TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 
@@ -33,6 +33,21 @@ class Asking:
         """As `ask`; raises `RefusedCall`."""
         try:
             return await asyncio.to_thread(ask, self._engine, path, **how)
+        except (OSError, ValueError) as error:
+            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+
+    async def have(self, path: str, method: str, patience: float, body: Any = None) -> Answer:
+        """Have it do what may take long, and takes no thread; raises `RefusedCall`.
+
+        Args:
+            path: With the query.
+            method: As HTTP names it.
+            patience: For all of it [s].
+            body: Sent as JSON, unless it is None.
+        """
+        try:
+            async with asyncio.timeout(patience):
+                return await ask_long(self._engine, path, method=method, body=body)
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 

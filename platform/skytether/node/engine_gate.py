@@ -44,7 +44,7 @@ from .files import Files
 from .machine import ANYWHERE, Answer, free_port, is_taken, listed
 from .pulls import AUTH, Pulls
 from .registries import Registries
-from .removals import BusyError, Removals
+from .removals import BusyError, Removals, begun
 from .store import NodeStore
 
 log = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ class EngineGate:
         self._large = asyncio.Semaphore(_MOST_LARGE)
         self._weighing, self._making = asyncio.Lock(), asyncio.Lock()
         asking = Asking(engine)
-        self._ask, self._asked = asking.ask, asking.asked
+        self._ask, self._asked, self._have = asking.ask, asking.asked, asking.have
         self._files = Files(engine, asking)
         names, keep = (store.names(), store.save_names) if store else ({}, lambda _: None)
         self._pulls = Pulls(asking, Registries(registries), names, keep)
@@ -206,9 +206,9 @@ class EngineGate:
         if path == WEIGHED:
             return self._weigh(target)
         if path == MADE:
-            return self._make(target, call.body)
+            return asyncio.shield(begun(self._make(target, call.body)))
         if path == _MAKES[0]:
-            return self._create(target, call.body)
+            return asyncio.shield(begun(self._create(target, call.body)))  # looked at, whoever waits for it
         if SEEN.fullmatch(path) and call.method == "GET":
             return self._network(target)
         if path.endswith("/archive") and call.method == "GET":
@@ -226,9 +226,9 @@ class EngineGate:
             if "v" in call.query:
                 removes = partial(self._removals.remove_container, name, target, f"{way}?{rest}")
                 return self._kept(self._removals.end(name, removes))
-            return self._kept(self._removals.end(name, partial(self._ask, target, method="DELETE", patience=_END_S)))
+            return self._kept(self._removals.end(name, partial(self._have, target, "DELETE", _END_S)))
         if kind == "containers" and path.endswith(("/kill", "/update")):
-            asks = partial(self._ask, target, method="POST", body=call.body, patience=_END_S)
+            asks = partial(self._have, target, "POST", _END_S, call.body)
             return self._kept(self._removals.end(name, asks))
         return None
 
@@ -313,12 +313,12 @@ class EngineGate:
         found = ((said.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT)
         for bound in found if isinstance(found, list) else ():
             bound["HostPort"] = bound.get("HostPort") or str(free_port(bound.get("HostIp") or ""))
-        answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
+        answer = await self._have(target, "POST", _MADE_S, said)
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
             described = await self._ask(f"/containers/{made}/json", most=_MOST_DESCRIBED + 1)
             if len(described.content) > _MOST_DESCRIBED:
-                await self._ask(f"/containers/{made}?force=1&v=1", method="DELETE", patience=_END_S)
+                await self._have(f"/containers/{made}?force=1&v=1", "DELETE", _END_S)
                 raise RefusedCall(
                     f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says"
                 )
@@ -330,7 +330,7 @@ class EngineGate:
             status, found = await self._asked(f"/networks?{urlencode({'filters': json.dumps({'label': [NETWORK]})})}")
             if status != HTTPStatus.OK or len(found) >= _MOST_NETWORKS:
                 raise RefusedCall(f"orchestrators made {_MOST_NETWORKS} networks here, as many as they may")
-            answer = await self._ask(target, method="POST", body=said, patience=_MADE_S)
+            answer = await self._have(target, "POST", _MADE_S, said)
         return answer.status, answer.content, JSON
 
     async def _network(self, target: str) -> tuple[int, bytes, str]:

@@ -200,7 +200,7 @@ def listed(
     return found
 
 
-async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -> Answer:
+async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"", body: Any = None) -> Answer:
     """One call that an engine may take any time for; of its answer there is the status, and what is in it.
 
     It takes no thread meanwhile: these are few.
@@ -210,6 +210,7 @@ async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -
         what: Path and query.
         method: As HTTP names it.
         archive: Sent, unless it is empty.
+        body: Sent as JSON in its place, unless it is None.
 
     Raises:
         OSError: It does not answer.
@@ -218,9 +219,11 @@ async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"") -
     reader, writer = await asyncio.open_unix_connection(path)
     try:
         # By this version an engine says no more than one answer, in one piece.
-        kind = "Content-Type: application/x-tar\r\n" if archive else ""
-        asked = f"{method} {what} HTTP/1.0\r\nHost: engine\r\n{kind}Content-Length: {len(archive)}\r\n\r\n"
-        writer.write(asked.encode() + archive)
+        content = archive if body is None else json.dumps(body).encode()
+        kind = "application/x-tar" if archive else "application/json"
+        row = f"Content-Type: {kind}\r\n" if content else ""
+        asked = f"{method} {what} HTTP/1.0\r\nHost: engine\r\n{row}Content-Length: {len(content)}\r\n\r\n"
+        writer.write(asked.encode() + content)
         said = b""
         while len(said) < _MOST and (piece := await reader.read(_MOST - len(said))):
             said += piece
