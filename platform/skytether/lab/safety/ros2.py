@@ -51,6 +51,8 @@ def enter(attacks: Attacks) -> None:
     add("program-frozen-stop", "a stop while the writer's program is frozen", _frozen_and("stop"), 4)
     add("program-frozen-agent", "the agent is killed while the writer's program is frozen", _frozen_and("agent"), 4)
     add("program-frozen-writer", "the writer is killed while its program is frozen", _frozen_and("writer"), 6)
+    farewell = "the writer is killed, its program frozen before its farewell, and goes on when another one drives"
+    add("program-frozen-farewell", farewell, _farewell, 10)
     add(
         "button-gate-frozen",
         "the button is pressed for a moment while the gate is frozen and scans pile up",
@@ -114,6 +116,19 @@ def _frozen_and(what: str) -> deaths.Run:
             stage.sleep(0.4)
 
     return run
+
+
+def _farewell(stage: Stage) -> None:
+    """A program whose writer has died tells the wheels to stand, if nobody else tells them anything."""
+    (program,) = _programs(stage, "writer")
+    stage.robot.signal("writer", signal.SIGKILL)
+    stage.sleep(0.05)
+    stage.robot.kill(program, signal.SIGSTOP)
+    stage.sleep(3.0)
+    stage.robot.start()
+    stage.drives_on("the robot drives on by the next writer")
+    stage.robot.kill(program, signal.SIGCONT)
+    stage.sleep(1.5)
 
 
 def _button(stage: Stage) -> None:

@@ -23,7 +23,7 @@ from skytether.guard.claim import Heir
 from skytether.guard.clock import now as boottime
 from skytether.guard.protocol import LARGEST, Answer, pack_answer, unpack_beat, unpack_enable
 from skytether.guard.settings import thaw
-from skytether.guard.teller import Teller, repeat_s
+from skytether.guard.teller import SPEAKS, Teller, repeat_s
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
 from skytether.messages import Twist, warm
@@ -66,6 +66,7 @@ class Writer:
         self._repeat_s = repeat_s(self._period, config.guard_s)
         self._watch = Watch(config.bounds(), self._period, config.guard_s)
         self._teller = Teller(wheels, self._watch, board, Role.FIRST, self._period, clock)
+        board.place(Role.FIRST).end_speaker(SPEAKS * self._period)  # left by a writer before this one
         self._log_throttle = LogThrottle(_log)
         self._heir = Heir(str(config.place()), guard)
         self._gone = False

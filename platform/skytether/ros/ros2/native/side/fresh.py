@@ -16,6 +16,10 @@ from .hearing import Hearing
 
 FAREWELL_S = 0.3
 """Within which whoever listens has acknowledged the last word, or is not waited for."""
+_LISTENS = 3
+"""Lifespans, of 1.5 periods. Whoever speaks says something each second period at least."""
+_LATE = 20
+"""Lifespans. Nobody has started another gate so soon; whose wheels hear nothing for longer, they have stopped."""
 _AT_ONCE = Duration(seconds=0)
 Speaking = Callable[[], contextlib.AbstractContextManager[None]]
 
@@ -68,11 +72,31 @@ class FreshPublisher:
             hearing.tell(publisher.get_subscription_count(), self._now())
         return dealt_with(frame.channel, number, hearing.unread_s, self._published, hearing.heard)
 
-    def say_farewell(self, body: bytes, after_s: float) -> None:
-        """Publish a last word until it is acknowledged; with ``after_s``, unless another node of our name speaks."""
+    def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
+        """Publish a last word until it is acknowledged.
+
+        This process may stand still at any moment, and go on when others have told the wheels something for long.
+
+        Args:
+            body: The word.
+            after_s: So much after now, unless somebody else speaks by then [s]; 0: at once, whoever does.
+            page: What those who speak write down in the same moment.
+        """
+        before = b""
+        if after_s:
+            listen_s = _LISTENS * self._lifespan_s
+            time.sleep(max(0.0, after_s - listen_s))
+            before = page()
+            time.sleep(listen_s)
+            if self._is_followed():
+                return
         until = time.monotonic() + FAREWELL_S
-        while time.monotonic() < until and not (after_s and self._is_followed()):
-            self._publisher.publish(body)
+        latest = self._published_at + after_s + _LATE * self._lifespan_s
+        while time.monotonic() < until:
+            with self._speaking():
+                if after_s and (page() != before or self._now() > latest):
+                    return
+                self._publisher.publish(body)
             if _has_been_read(self._publisher, Duration(seconds=min(FAREWELL_S, self._lifespan_s / 2))):
                 return
 

@@ -166,11 +166,10 @@ class Program:
         return code
 
     def _leave(self) -> None:
-        began = time.monotonic()
-        for channel, (body, after_s) in sorted(self._farewells.items(), key=lambda item: item[1][1]):
-            time.sleep(max(0.0, began + after_s - time.monotonic()))
+        page = self._speaking.page if isinstance(self._speaking, Speaking) else bytes
+        for channel, (body, after_s) in self._farewells.items():
             with contextlib.suppress(Exception):
-                self._fresh[channel].say_farewell(body, after_s)
+                self._fresh[channel].say_farewell(body, after_s, page)
         self._sender.close()
         with contextlib.suppress(Exception):
             rclpy.try_shutdown()

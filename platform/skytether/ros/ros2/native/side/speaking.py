@@ -11,6 +11,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+_PAGE = 4096
+
 
 class Speaking:
     """A lock on one byte of a file, that of this process's number, which the kernel shows to whoever has the file.
@@ -23,6 +25,10 @@ class Speaking:
     def __init__(self, file: int, start: int) -> None:
         self._file = file
         self._byte = start + os.getpid()
+
+    def page(self) -> bytes:
+        """What those who tell the wheels something have written down in that file."""
+        return os.pread(self._file, _PAGE, 0)
 
     @contextmanager
     def __call__(self) -> Iterator[None]:
