@@ -38,6 +38,9 @@ class Wheels:
     def full(self):
         return not self.room
 
+    def held_since(self):
+        return None
+
     def unread(self):
         return self.silent
 

@@ -36,7 +36,7 @@ class SafeConsole(Console):
 
     def __init__(self, **how: Any) -> None:
         super().__init__(**how)
-        if self._width is None and not self.is_terminal:
+        if "width" not in how and not self.is_terminal:  # whatever COLUMNS says
             self.width = _WIDE
 
     @override

@@ -9,6 +9,8 @@ the other one has either seen that or cannot speak any more:
 - The first, once the second may speak (`LATE` periods after its claim), claims too and waits for a period, in which
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
+- Where another process sends what is written and stands still, the wheels were told what had left before that, and
+  whoever is next goes on from there.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -24,6 +26,7 @@ hear it, and if they do not, the first word that reaches them again finds them a
 from __future__ import annotations
 
 import errno
+from collections import deque
 from collections.abc import Callable
 from math import isnan, nan
 from typing import Protocol
@@ -45,6 +48,8 @@ _UNREAD = "their driver does not read what it is sent"
 _ENDED = "process {} stood still as it told the wheels something, and was ended: it would go on with what is old by now"
 _LATER = 2
 """Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
+_WRITTEN = 256
+"""Velocities that are remembered: of the time within which it is seen that who sends them stands still."""
 _AGAIN_S = 1.0
 """Between attempts on a way that is broken; meanwhile the other one speaks."""
 
@@ -83,6 +88,10 @@ class Wheels(Protocol):
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
+    def held_since(self) -> float | None:
+        """Who sends what is written stands still: when the last was written that left [s]; None: nobody does."""
+        ...
+
 
 class Teller:
     """One who tells the wheels.
@@ -107,6 +116,9 @@ class Teller:
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers = False
+        self._held = False
+        self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
+        """The newest last."""
         self.unread = ""
         """What is wrong with those who were told something last: they do not acknowledge it; empty: nothing."""
         self.ended = ""
@@ -117,7 +129,15 @@ class Teller:
 
     def refresh(self) -> None:
         """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
+        held, was_held = self._wheels.held_since(), self._held
+        self._held = held is not None
+        if held is not None:
+            self._take_back(held)
+        if self._held or was_held:
+            self._watch.told = self._board.newest()  # what was learned may have been taken back
         self._watch.learn(self._board.newest())
+        if self._held:
+            return
         before, self._listeners = self._listeners, self._wheels.listeners()
         self._strangers = bool(self._listeners) and not (before and self._listeners and before & self._listeners)
 
@@ -138,7 +158,7 @@ class Teller:
             Exception: This way to them is broken. It counts as silence.
         """
         self.ended = ""
-        unheard = self._listeners is not None and not self._listeners
+        unheard = self._held or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
         if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:
@@ -167,6 +187,7 @@ class Teller:
             self._broken_at = now
             raise
         self._watch.wrote(velocity, now)
+        self._written.append(self._watch.told)
         self._put(self._watch.told)
         return True
 
@@ -212,6 +233,13 @@ class Teller:
         if isnan(self._claim) or sign > self._claim:
             self._put(self._own, at)
         return at >= self._claim + LATE * self._period_s
+
+    def _take_back(self, left_at: float) -> None:
+        """What was written after what left, the wheels were not told, and never are: it is too old by then."""
+        while self._written and self._written[-1].at > left_at:
+            self._written.pop()
+        if self._own.at > left_at:
+            self._put(self._written[-1] if self._written else LastCommand())
 
     def _failed(self, now: float) -> None:
         self._watch.failed(now)

@@ -52,6 +52,10 @@ class SocketWheels:
         """Wheels: not known; a driver that does not read has no room left."""
         return ""
 
+    def held_since(self) -> float | None:
+        """Teller's Wheels: nobody else sends it."""
+        return None
+
     def listeners(self) -> frozenset[str] | None:
         """Wheels: not known; a driver that starts anew is a write that fails."""
         return None

@@ -36,7 +36,7 @@ class Asking:
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 
-    async def have(self, path: str, method: str, patience: float, body: Any = None) -> Answer:
+    async def have(self, path: str, method: str, patience: float, body: Any = None, **how: Any) -> Answer:
         """Have it do what may take long, and takes no thread; raises `RefusedCall`.
 
         Args:
@@ -44,10 +44,11 @@ class Asking:
             method: As HTTP names it.
             patience: For all of it [s].
             body: Sent as JSON, unless it is None.
+            how: As of `ask_long`.
         """
         try:
             async with asyncio.timeout(patience):
-                return await ask_long(self._engine, path, method=method, body=body)
+                return await ask_long(self._engine, path, method=method, body=body, **how)
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 

@@ -125,7 +125,6 @@ def ask(
     *,
     method: str = "GET",
     body: Any = None,
-    headers: Mapping[str, str] | None = None,
     patience: float = _ENGINE_S,
     most: int = _MOST,
 ) -> Answer:
@@ -136,7 +135,6 @@ def ask(
         what: Path and query.
         method: As HTTP names it.
         body: Sent as JSON, unless it is None.
-        headers: More of them.
         patience: Seconds for each step of it.
         most: Bytes of the answer, which is cut off there.
 
@@ -144,19 +142,16 @@ def ask(
         OSError: It does not answer.
         ValueError: It answers something else.
     """
-    with _answered(path, what, method, body, headers or {}, patience) as answer:
+    with _answered(path, what, method, body, patience) as answer:
         return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read(most))
 
 
 @contextlib.contextmanager
-def _answered(
-    path: str, what: str, method: str, body: Any, headers: Mapping[str, str], patience: float
-) -> Iterator[http.client.HTTPResponse]:
+def _answered(path: str, what: str, method: str, body: Any, patience: float) -> Iterator[http.client.HTTPResponse]:
     connection = _Connection(path, patience)
     try:
         text = None if body is None else json.dumps(body)
-        kind = {"Content-Type": "application/json"} if text else {}
-        connection.request(method, what, text, {**headers, **kind})
+        connection.request(method, what, text, {"Content-Type": "application/json"} if text else {})
         yield connection.getresponse()
     except http.client.HTTPException as error:
         raise ValueError(f"what listens at {path} is no Docker engine: it speaks no HTTP") from error
@@ -182,8 +177,9 @@ def listed(
         ValueError: It answers something else.
     """
     found: list[dict[str, Any]] = []
-    start, until = "", time.monotonic() + _LIST_S
-    with _answered(path, what, "GET", None, {}, patience) as answer:
+    start = ""
+    with _answered(path, what, "GET", None, patience) as answer:
+        until = time.monotonic() + _LIST_S
         if answer.status != http.HTTPStatus.OK:
             raise ValueError(f"it answers {answer.status}")
         try:
@@ -200,7 +196,15 @@ def listed(
     return found
 
 
-async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"", body: Any = None) -> Answer:
+async def ask_long(
+    path: str,
+    what: str,
+    *,
+    method: str,
+    archive: bytes = b"",
+    body: Any = None,
+    headers: Mapping[str, str] | None = None,
+) -> Answer:
     """One call that an engine may take any time for; of its answer there is the status, and what is in it.
 
     It takes no thread meanwhile: these are few.
@@ -211,6 +215,7 @@ async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"", b
         method: As HTTP names it.
         archive: Sent, unless it is empty.
         body: Sent as JSON in its place, unless it is None.
+        headers: More of them.
 
     Raises:
         OSError: It does not answer.
@@ -221,8 +226,9 @@ async def ask_long(path: str, what: str, *, method: str, archive: bytes = b"", b
         # By this version an engine says no more than one answer, in one piece.
         content = archive if body is None else json.dumps(body).encode()
         kind = "application/x-tar" if archive else "application/json"
-        row = f"Content-Type: {kind}\r\n" if content else ""
-        asked = f"{method} {what} HTTP/1.0\r\nHost: engine\r\n{row}Content-Length: {len(content)}\r\n\r\n"
+        given = {"Host": "engine", **({"Content-Type": kind} if content else {}), **(headers or {})}
+        rows = "".join(f"{key}: {value}\r\n" for key, value in given.items())
+        asked = f"{method} {what} HTTP/1.0\r\n{rows}Content-Length: {len(content)}\r\n\r\n"
         writer.write(asked.encode() + content)
         said = b""
         while len(said) < _MOST and (piece := await reader.read(_MOST - len(said))):

@@ -63,7 +63,7 @@ class Pulls:
         if (await self._asking.ask(f"/images/{name}/json", most=1)).status != HTTPStatus.NOT_FOUND:
             raise RefusedCall(f"the image {name[:80]} is this machine's own: nothing else is pulled by that name")
         auth = {"X-Registry-Auth": headers[AUTH].decode()} if AUTH in headers else {}
-        answer = await self._asking.ask(f"/distribution/{name}/json", headers=auth, patience=_REGISTRY_S)
+        answer = await self._asking.have(f"/distribution/{name}/json", "GET", _REGISTRY_S, headers=auth)
         try:
             said = json.loads(answer.content)
             if answer.status != HTTPStatus.OK:

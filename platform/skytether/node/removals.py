@@ -294,7 +294,7 @@ class Removals:
                     begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
-        except TooMuchError:
+        except (TooMuchError, TimeoutError):  # it has so much that it takes long to tell
             self._kin.lose()
         self._looked_back = True
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from .seccomp_calls import CALLS
 
-_REFUSES = {f"SCMP_ACT_{word}" for word in ("ERRNO", "KILL", "KILL_PROCESS", "KILL_THREAD", "TRAP")}
+_REFUSES = {f"SCMP_ACT_{word}" for word in ("ERRNO", "KILL_PROCESS", "TRAP")}
+"""None that ends one thread: runc has several, and the others wait for ever, and whoever started it."""
 _NEW_NAMESPACES = 0x7E020000
 """Flags of ``clone``."""
 _FLAGS_SECOND = {"s390", "s390x"}

@@ -146,6 +146,9 @@ class HubWheels:
     def full(self) -> bool:
         return False
 
+    def held_since(self) -> float | None:
+        return None
+
     def unread(self) -> str:
         return ""
 

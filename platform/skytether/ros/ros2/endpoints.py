@@ -13,6 +13,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import inf
 from typing import Any, Protocol
 
 import zenoh
@@ -99,6 +100,7 @@ class Publication(Handle):
     unread_s = 0.0
     heard = True
     renewed = 0
+    left_at: float = inf
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 

@@ -66,6 +66,11 @@ class Publication(Handle, Protocol):
         """How often who listens was not known to hear any more: somebody may have come in another's place."""
         ...
 
+    @property
+    def left_at(self) -> float:
+        """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
+        ...
+
     def put(self, payload: bytes | memoryview) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
         ...

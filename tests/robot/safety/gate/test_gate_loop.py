@@ -52,6 +52,9 @@ class Hardware:
     def write(self, velocity: Velocity) -> None:
         self.told.append(velocity)
 
+    def held_since(self) -> float | None:
+        return None
+
     def unread(self) -> str:
         return ""
 

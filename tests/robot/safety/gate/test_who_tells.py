@@ -38,6 +38,9 @@ class Way:
     def write(self, velocity):
         self.stage.told.append((self.stage.now, self.who, velocity))
 
+    def held_since(self):
+        return None
+
     def unread(self):
         return ""
 

@@ -72,6 +72,10 @@ class RosWheels(RosGateNode[Node]):
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
 
+    def held_since(self) -> float | None:
+        """Wheels: nobody else sends it."""
+        return None
+
     @property
     def others(self) -> Others:
         """WatchesWheels: who else publishes the topic; the gate's own looks for that."""

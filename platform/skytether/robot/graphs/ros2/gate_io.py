@@ -92,9 +92,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, of those that turn the wheels; none while they cannot be told anything."""
-        if self._publication.stuck and self._place is not None:  # who would take over may be dead
-            self._place.end_speaker(self._speaks_s)
-        if self._publication.stuck or self._publication.refused:
+        if self._publication.refused:
             return frozenset()
         lives = self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes)
         if self._nodes:
@@ -102,6 +100,14 @@ class Ros2Wheels(RosWheels[GraphNode]):
             self._look_for(self._nodes, there, self._topic)
         # Beside a recorder, say, the wheels' node may have been started again.
         return frozenset(f"{life} {self._publication.renewed}" for life in lives)
+
+    def held_since(self) -> float | None:
+        """Wheels: the program stands still."""
+        if not self._publication.stuck:
+            return None
+        if self._place is not None:  # who would take over may be dead
+            self._place.end_speaker(self._speaks_s)
+        return self._publication.left_at
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

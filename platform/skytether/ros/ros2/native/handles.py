@@ -126,6 +126,8 @@ class Publication(Handle):
         """When the program said for how long what was published is unread, and that [s]."""
         self._published = 0
         """Of those, as this program counts them."""
+        self.left_at = -inf
+        """When the last was put that is known to have been published, of those with `fresh_s` [s]."""
         self._heard = False
         self.renewed = 0
         """See `skytether.ros.ros2.seam.Publication.renewed`."""
@@ -186,12 +188,14 @@ class Publication(Handle):
             self.renewed += self._heard and not heard
             self._heard = heard
             self._unread = (_now(), unread_s)
-            waited = len(self._waiting)
+            over = []
             while self._waiting and self._waiting[0][0] <= number:
-                self._waiting.popleft()
+                over.append(self._waiting.popleft()[1])
             new, self._published = published - self._published, published
+            if new > 0 and over:
+                self.left_at = over[min(new, len(over)) - 1]
             self.passed += new
-            self.dropped += waited - len(self._waiting) - new  # too old, or a newer one came before their turn
+            self.dropped += len(over) - new  # too old, or a newer one came before their turn
 
     def begin(self) -> None:
         self._begun = True

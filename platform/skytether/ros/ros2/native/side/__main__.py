@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from functools import partial
 from pathlib import Path
 
 _NAME = "skytether_ros2_side"
@@ -19,8 +20,10 @@ def _main() -> int:
         raise ImportError(f"{folder} is no package")
     sys.modules[_NAME] = package = importlib.util.module_from_spec(found)
     found.loader.exec_module(package)
+    real_time = importlib.import_module(f"{_NAME}.real_time")
+    before = real_time.leave()
     program = importlib.import_module(f"{_NAME}.program")
-    return int(program.main(sys.argv[1:]))
+    return int(program.main(sys.argv[1:], partial(real_time.resume, before)))
 
 
 if __name__ == "__main__":

@@ -54,9 +54,9 @@ class FreshPublisher:
         self._published, self._published_at = 0, now()
         self._read = True
 
-    def publish(self, frame: Frame) -> Frame:
-        """Publish it, if it is fresh; returns what the agent is told of that."""
-        number, until, heeds, body = pull_fresh(frame.body)
+    def publish(self, frame: Frame) -> None:
+        """Publish it, if it is fresh."""
+        _, until, heeds, body = pull_fresh(frame.body)
         hearing, publisher, now = self._hearing, self._publisher, self._now()
         if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
             self._read = _has_been_read(publisher, _AT_ONCE)
@@ -70,7 +70,11 @@ class FreshPublisher:
         if new:
             self._published += 1
             hearing.tell(publisher.get_subscription_count(), self._now())
-        return dealt_with(frame.channel, number, hearing.unread_s, self._published, hearing.heard)
+
+    def answer(self, frame: Frame) -> Frame:
+        """What the agent is told of one that was dealt with."""
+        number, *_ = pull_fresh(frame.body)
+        return dealt_with(frame.channel, number, self._hearing.unread_s, self._published, self._hearing.heard)
 
     def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
         """Publish a last word until it is acknowledged.

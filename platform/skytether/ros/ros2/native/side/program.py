@@ -205,8 +205,11 @@ class Program:
             if publisher is not None:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
-            if (fresh_publisher := self._fresh.get(frame.channel)) is not None:
-                self._sender.put(fresh_publisher.publish(frame))
+            if (publication := self._fresh.get(frame.channel)) is not None:
+                try:
+                    publication.publish(frame)
+                finally:  # or what waits for an answer would wait for ever
+                    self._sender.put(publication.answer(frame))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -433,11 +436,12 @@ def _now() -> float:
     return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str], on_node: Callable[[], object] = lambda: None) -> int:
     """Be the node of the agent that has the other end of a socket.
 
     Args:
         arguments: The socket's descriptor.
+        on_node: Called when the node is there.
     """
     for ignored in (signal.SIGINT, signal.SIGTERM):  # whoever ends the agent ends this program, by the socket
         signal.signal(ignored, signal.SIG_IGN)
@@ -448,6 +452,7 @@ def main(arguments: list[str]) -> int:
         return 0
     try:
         program = Program(link, json.loads(first.body))
+        on_node()
     except Exception as error:
         with contextlib.suppress(OSError):
             frame = control(what="refused", why=f"{type(error).__name__}: {error}")
