@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -111,7 +112,10 @@ def _frozen_and(what: str) -> deaths.Run:
                 stage.stop()
             else:
                 stage.robot.signal(what, signal.SIGKILL)
-            stage.sleep(1.0)
+            stage.sleep(0.5)
+        # The next writer, when its program is there, drives on: from the standstill.
+        with contextlib.nullcontext() if what == "writer" else stage.stands(0.0, "the program goes on"):
+            stage.sleep(0.5)
             stage.robot.kill(frozen, signal.SIGCONT)
             stage.sleep(0.4)
 
