@@ -32,14 +32,14 @@ class Wheels:
         self.nodes = frozenset({"/base"})
         self.fails: Exception | None = None
         self.room = True
-
+        self.held = None
         self.silent = ""
 
     def full(self):
         return not self.room
 
     def held_since(self):
-        return None
+        return self.held
 
     def unread(self):
         return self.silent
@@ -102,6 +102,27 @@ def test_the_second_takes_over_from_what_was_told_and_brakes_within_the_limits(b
     assert told[0] == pytest.approx(0.4 - 2.0 * 0.06)
     assert told[1] == pytest.approx(told[0] - 2.0 * 0.02)
     assert told[-1] == 0.0
+
+
+def test_what_had_not_left_the_wheels_were_not_told(both):
+    """Programs of both were frozen for 0.16 s; the wheels, silent for longer than they turn, were told 0.4 m/s first."""
+    first, second = both
+    for i in range(3):
+        first.turn(1.0 + i * PERIOD, FAST)
+    first.wheels.held = 1.0  # what was written then had left, and nothing since
+    assert not first.turn(1.06, FAST)
+    assert first.board.newest() == LastCommand(first.wheels.told[0], 1.0)
+    assert second.turn(1.07) is False
+    assert second.turn(1.09) is True
+    assert second.wheels.told[-1].linear == pytest.approx(0.4 - 2.0 * 0.09), "from what they were told really"
+    first.turn(1.1, FAST)  # sees that, as if they were told so
+    second.wheels.held = -1.0
+    assert not second.turn(1.11)
+    assert second.board.newest().at == 1.0
+    assert not first.turn(1.12, FAST)
+    first.wheels.held = None
+    assert any(first.turn(1.16 + i * PERIOD, FAST) for i in range(5))
+    assert first.wheels.told[-1] == STANDSTILL, "they have heard nothing for longer than they turn"
 
 
 def test_one_that_died_just_after_it_had_told_something_is_known_exactly(both):

@@ -528,6 +528,8 @@ def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: 
         [NEEDED, {"names": ["close", "close_range"], "action": "SCMP_ACT_ERRNO"}],
         [NEEDED, {"name": "close", "action": "SCMP_ACT_ERRNO"}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": 0}],
+        [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_KILL_THREAD"}],
+        [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_KILL"}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": 1 << 16}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": "38"}],
     ],
