@@ -105,7 +105,7 @@ def test_the_second_takes_over_from_what_was_told_and_brakes_within_the_limits(b
 
 
 def test_what_had_not_left_the_wheels_were_not_told(both):
-    """Programs of both were frozen for 0.16 s; the wheels, silent for longer than they turn, were told 0.4 m/s first."""
+    """Programs of both stood still for 0.16 s; the wheels, silent for longer than they turn, heard 0.4 m/s first."""
     first, second = both
     for i in range(3):
         first.turn(1.0 + i * PERIOD, FAST)
