@@ -16,7 +16,7 @@ from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
 from skytether.guard.kinematics import Bounds
 from skytether.guard.protocol import Beat, LastCommand
-from skytether.guard.teller import Teller
+from skytether.guard.teller import Lost, Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.ros.ros2 import native
@@ -38,7 +38,7 @@ class Wheels:
     def full(self):
         return not self.room
 
-    def held_since(self):
+    def lost_after(self):
         return self.held
 
     def unread(self):
@@ -109,20 +109,33 @@ def test_what_had_not_left_the_wheels_were_not_told(both):
     first, second = both
     for i in range(3):
         first.turn(1.0 + i * PERIOD, FAST)
-    first.wheels.held = 1.0  # what was written then had left, and nothing since
+    first.wheels.held = Lost(1.0, stuck=True)  # what was written then had left, and nothing since
     assert not first.turn(1.06, FAST)
     assert first.board.newest() == LastCommand(first.wheels.told[0], 1.0)
     assert second.turn(1.07) is False
     assert second.turn(1.09) is True
     assert second.wheels.told[-1].linear == pytest.approx(0.4 - 2.0 * 0.09), "from what they were told really"
     first.turn(1.1, FAST)  # sees that, as if they were told so
-    second.wheels.held = -1.0
+    second.wheels.held = Lost(-1.0, stuck=True)
     assert not second.turn(1.11)
     assert second.board.newest().at == 1.0
     assert not first.turn(1.12, FAST)
     first.wheels.held = None
     assert any(first.turn(1.16 + i * PERIOD, FAST) for i in range(5))
     assert first.wheels.told[-1] == STANDSTILL, "they have heard nothing for longer than they turn"
+
+
+def test_what_could_not_be_published_the_wheels_were_not_told_and_are_told_to_stand_first(both):
+    """Publishing failed for 2 s, and the first that did not was full speed."""
+    first, _ = both
+    first.turn(1.0, FAST)
+    first.wheels.held = Lost(1.0, stuck=False)
+    for i in range(1, 20):
+        assert first.turn(1.0 + i * PERIOD, FAST)
+    assert first.wheels.told[-1] == STANDSTILL
+    first.wheels.held = None
+    assert first.turn(1.4, FAST)
+    assert first.wheels.told[-1].linear <= BOUNDS.linear_max * 0.1
 
 
 def test_one_that_died_just_after_it_had_told_something_is_known_exactly(both):

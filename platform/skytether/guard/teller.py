@@ -9,8 +9,8 @@ the other one has either seen that or cannot speak any more:
 - The first, once the second may speak (`LATE` periods after its claim), claims too and waits for a period, in which
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
-- Where another process sends what is written and stands still, the wheels were told what had left before that, and
-  whoever is next goes on from there.
+- Where another process sends what is written, and stands still or fails, the wheels were told what had left before
+  that, and whoever is next goes on from there.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -29,7 +29,7 @@ import errno
 from collections import deque
 from collections.abc import Callable
 from math import isnan, nan
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from .board import Board, Entry, Role
 from .protocol import LastCommand
@@ -63,6 +63,15 @@ def repeat_s(period_s: float, patience_s: float) -> float:
     return min(max(patience_s - 3 * period_s, 1.25 * period_s), 2 * period_s)
 
 
+class Lost(NamedTuple):
+    """What was written has not left, and never will."""
+
+    left_at: float
+    """When the last was written that did [s]."""
+    stuck: bool
+    """Who sends it stands still: nothing can be written now."""
+
+
 class Wheels(Protocol):
     """Where velocities go."""
 
@@ -88,8 +97,8 @@ class Wheels(Protocol):
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
-    def held_since(self) -> float | None:
-        """Who sends what is written stands still: when the last was written that left [s]; None: nobody does."""
+    def lost_after(self) -> Lost | None:
+        """Whether what was written last is known not to have left; None: it is not."""
         ...
 
 
@@ -116,7 +125,7 @@ class Teller:
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers = False
-        self._held = False
+        self._lost: Lost | None = None
         self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
         """The newest last."""
         self.unread = ""
@@ -129,17 +138,17 @@ class Teller:
 
     def refresh(self) -> None:
         """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
-        held, was_held = self._wheels.held_since(), self._held
-        self._held = held is not None
-        if held is not None:
-            self._take_back(held)
-        if self._held or was_held:
+        lost, before = self._wheels.lost_after(), self._lost
+        self._lost = lost
+        if lost:
+            self._take_back(lost.left_at)
+        if lost or before:
             self._watch.told = self._board.newest()  # what was learned may have been taken back
         self._watch.learn(self._board.newest())
-        if self._held:
+        if lost and lost.stuck:
             return
-        before, self._listeners = self._listeners, self._wheels.listeners()
-        self._strangers = bool(self._listeners) and not (before and self._listeners and before & self._listeners)
+        known, self._listeners = self._listeners, self._wheels.listeners()
+        self._strangers = bool(self._listeners) and not (known and self._listeners and known & self._listeners)
 
     def write_velocity(self, now: float, stopped: bool = False) -> bool:
         """Tell the wheels once what the watch has for them. `refresh` comes before.
@@ -158,7 +167,8 @@ class Teller:
             Exception: This way to them is broken. It counts as silence.
         """
         self.ended = ""
-        unheard = self._held or (self._listeners is not None and not self._listeners)
+        stuck = self._lost is not None and self._lost.stuck
+        unheard = stuck or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
         if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:

@@ -8,6 +8,7 @@ import socket
 from .descriptors import receive
 from .folder import check_listener
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
+from .teller import Lost
 from .velocity import Velocity
 
 Address = str | tuple[str, int]
@@ -52,7 +53,7 @@ class SocketWheels:
         """Wheels: not known; a driver that does not read has no room left."""
         return ""
 
-    def held_since(self) -> float | None:
+    def lost_after(self) -> Lost | None:
         """Teller's Wheels: nobody else sends it."""
         return None
 

@@ -146,7 +146,7 @@ class HubWheels:
     def full(self) -> bool:
         return False
 
-    def held_since(self) -> float | None:
+    def lost_after(self) -> None:
         return None
 
     def unread(self) -> str:

@@ -100,6 +100,7 @@ class Publication(Handle):
     unread_s = 0.0
     heard = True
     renewed = 0
+    lost = False
     left_at: float = inf
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""

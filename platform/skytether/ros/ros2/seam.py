@@ -67,6 +67,11 @@ class Publication(Handle, Protocol):
         ...
 
     @property
+    def lost(self) -> bool:
+        """Whether the last of those with ``fresh_s`` is known not to have been published, and never to be."""
+        ...
+
+    @property
     def left_at(self) -> float:
         """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
         ...

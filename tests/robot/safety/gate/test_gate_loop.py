@@ -52,7 +52,7 @@ class Hardware:
     def write(self, velocity: Velocity) -> None:
         self.told.append(velocity)
 
-    def held_since(self) -> float | None:
+    def lost_after(self) -> None:
         return None
 
     def unread(self) -> str:

@@ -38,7 +38,7 @@ class Way:
     def write(self, velocity):
         self.stage.told.append((self.stage.now, self.who, velocity))
 
-    def held_since(self):
+    def lost_after(self):
         return None
 
     def unread(self):

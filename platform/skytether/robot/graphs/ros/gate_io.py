@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from skytether.control.admittance import Velocity
+from skytether.guard.teller import Lost
 from skytether.messages import Message, Twist, Vector3
 
 from ..inbox import Inbox
@@ -72,7 +73,7 @@ class RosWheels(RosGateNode[Node]):
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
 
-    def held_since(self) -> float | None:
+    def lost_after(self) -> Lost | None:
         """Wheels: nobody else sends it."""
         return None
 

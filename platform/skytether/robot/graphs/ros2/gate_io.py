@@ -13,6 +13,7 @@ from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.guard.board import Place
+from skytether.guard.teller import Lost
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
@@ -101,13 +102,12 @@ class Ros2Wheels(RosWheels[GraphNode]):
         # Beside a recorder, say, the wheels' node may have been started again.
         return frozenset(f"{life} {self._publication.renewed}" for life in lives)
 
-    def held_since(self) -> float | None:
-        """Wheels: the program stands still."""
-        if not self._publication.stuck:
-            return None
-        if self._place is not None:  # who would take over may be dead
+    def lost_after(self) -> Lost | None:
+        """Wheels: what the program has not published in time, or cannot."""
+        stuck = self._publication.stuck
+        if stuck and self._place is not None:  # who would take over may be dead
             self._place.end_speaker(self._speaks_s)
-        return self._publication.left_at
+        return Lost(self._publication.left_at, stuck) if stuck or self._publication.lost else None
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

@@ -128,6 +128,8 @@ class Publication(Handle):
         """Of those, as this program counts them."""
         self.left_at = -inf
         """When the last was put that is known to have been published, of those with `fresh_s` [s]."""
+        self.lost = False
+        """Whether the program has dealt with the last of those, and not published it."""
         self._heard = False
         self.renewed = 0
         """See `skytether.ros.ros2.seam.Publication.renewed`."""
@@ -192,6 +194,8 @@ class Publication(Handle):
             while self._waiting and self._waiting[0][0] <= number:
                 over.append(self._waiting.popleft()[1])
             new, self._published = published - self._published, published
+            if over:
+                self.lost = new <= 0
             if new > 0 and over:
                 self.left_at = over[min(new, len(over)) - 1]
             self.passed += new
