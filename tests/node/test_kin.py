@@ -51,7 +51,7 @@ def test_who_has_ended_is_kin_still_as_long_as_one_of_them_runs() -> None:
     assert "last" in kin.of(("volume 1",))
     assert kin.of(("volume 3",)) == {"volume 3"}
     kin.keep(())
-    assert len(kin) == 0
+    assert len(kin.all()) == 0
 
 
 def test_of_whom_none_runs_all_are_forgotten() -> None:
@@ -74,7 +74,7 @@ def test_of_more_than_some_nobody_knows_who_met_whom_until_nobody_runs() -> None
     kin.meet(("b", "volume 2"))
     assert kin.lost
     kin.meet(("c", "volume 2"))
-    assert len(kin) == 0
+    assert len(kin.all()) == 0
     kin.keep(("a",))
     assert kin.lost
     kin.keep(())

@@ -142,9 +142,11 @@ class Teller:
         self._lost = lost
         if lost:
             self._take_back(lost.left_at)
+        newest = self._board.newest()
         if lost or before:
-            self._watch.told = self._board.newest()  # what was learned may have been taken back
-        self._watch.learn(self._board.newest())
+            self._watch.told = newest  # what was learned may have been taken back
+        else:
+            self._watch.learn(newest)
         if lost and lost.stuck:
             return
         known, self._listeners = self._listeners, self._wheels.listeners()

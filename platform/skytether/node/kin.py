@@ -24,9 +24,6 @@ class Kin:
         self._groups: dict[str, set[str]] = {}
         """By each thing all that are its kin, itself too: one object for all of these."""
 
-    def __len__(self) -> int:
-        return len(self._groups)
-
     def has_room(self, things: Iterable[str]) -> bool:
         """Whether so many more may be known."""
         return len(self._groups) + len(set(things) - self._groups.keys()) <= self._most

@@ -89,10 +89,11 @@ class Pulls:
     async def path_of(self, path: str) -> str:
         """By what path an engine is asked for an image: its own by that name goes first."""
         found = _IMAGE.fullmatch(path)
-        name = found[2] if found else ""
-        repository, tag = _split(name)
+        if found is None:
+            return path
+        repository, tag = _split(found[2])
         digests = self._names.get(_familiar(f"{repository}:{tag or 'latest'}"), ())
-        if found is None or not digests or (await self._status(path)) != HTTPStatus.NOT_FOUND:
+        if not digests or (await self._status(path)) != HTTPStatus.NOT_FOUND:
             return path
         for digest in digests:
             pinned = f"{found[1]}{repository}@{digest}/json"

@@ -11,7 +11,7 @@ from typing import Any
 from rclpy.duration import Duration
 
 from . import graph
-from .frames import Frame, dealt_with, pull_fresh
+from .frames import Frame, dealt_with
 from .hearing import Hearing
 
 FAREWELL_S = 0.3
@@ -54,9 +54,14 @@ class FreshPublisher:
         self._published, self._published_at = 0, now()
         self._read = True
 
-    def publish(self, frame: Frame) -> None:
-        """Publish it, if it is fresh."""
-        _, until, heeds, body = pull_fresh(frame.body)
+    def publish(self, until: float, heeds: bool, body: bytes) -> None:
+        """Publish a message.
+
+        Args:
+            until: Not after that [s].
+            heeds: It is no first word for somebody.
+            body: The message, serialised.
+        """
         hearing, publisher, now = self._hearing, self._publisher, self._now()
         if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
             self._read = _has_been_read(publisher, _AT_ONCE)
@@ -71,10 +76,9 @@ class FreshPublisher:
             self._published += 1
             hearing.tell(publisher.get_subscription_count(), self._now())
 
-    def answer(self, frame: Frame) -> Frame:
+    def answer(self, channel: int, number: int) -> Frame:
         """What the agent is told of one that was dealt with."""
-        number, *_ = pull_fresh(frame.body)
-        return dealt_with(frame.channel, number, self._hearing.unread_s, self._published, self._hearing.heard)
+        return dealt_with(channel, number, self._hearing.unread_s, self._published, self._hearing.heard)
 
     def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
         """Publish a last word until it is acknowledged.

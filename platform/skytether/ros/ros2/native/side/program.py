@@ -38,6 +38,7 @@ from .frames import (
     fresh,
     numbered,
     pull_frame,
+    pull_fresh,
     pull_number,
     push_head,
 )
@@ -206,10 +207,11 @@ class Program:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
             if (publication := self._fresh.get(frame.channel)) is not None:
+                number, until, heeds, body = pull_fresh(frame.body)
                 try:
-                    publication.publish(frame)
+                    publication.publish(until, heeds, body)
                 finally:  # or what waits for an answer would wait for ever
-                    self._sender.put(publication.answer(frame))
+                    self._sender.put(publication.answer(frame.channel, number))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
