@@ -7,7 +7,7 @@ import struct
 import subprocess
 import sys
 from contextlib import closing, contextmanager, suppress
-from math import isnan, nan
+from math import inf, isnan, nan
 from pathlib import Path
 
 import pytest
@@ -16,7 +16,7 @@ from skytether.guard import board
 from skytether.guard.board import Board, Entry, Role
 from skytether.guard.kinematics import Bounds
 from skytether.guard.protocol import Beat, LastCommand
-from skytether.guard.teller import Lost, Teller
+from skytether.guard.teller import Sent, Teller
 from skytether.guard.velocity import STANDSTILL, Velocity
 from skytether.guard.watch import Watch
 from skytether.ros.ros2 import native
@@ -29,6 +29,7 @@ FAST = Velocity(0.4, 0.0)
 class Wheels:
     def __init__(self):
         self.told = []
+        self.untils = []
         self.nodes = frozenset({"/base"})
         self.fails: Exception | None = None
         self.room = True
@@ -38,18 +39,19 @@ class Wheels:
     def full(self):
         return not self.room
 
-    def lost_after(self):
+    def sent(self):
         return self.held
 
     def unread(self):
         return self.silent
 
-    def write(self, velocity):
+    def write(self, velocity, until):
         if self.fails:
             raise self.fails
         if not self.room:
             raise BlockingIOError
         self.told.append(velocity)
+        self.untils.append(until)
 
     def listeners(self):
         return self.nodes
@@ -77,7 +79,7 @@ class One:
 def both():
     file = board.make()
     with closing(board.Board(file)) as page:
-        page.put(Role.FIRST, Entry(LastCommand(FAST, 0.98)))  # by who had the role before
+        page.put(Role.FIRST, Entry(LastCommand(FAST, 0.98), left_at=0.98))  # by who had the role before
     first, second = One(file, Role.FIRST), One(file, Role.SECOND)
     yield first, second
     for one in (first, second):
@@ -109,27 +111,54 @@ def test_what_had_not_left_the_wheels_were_not_told(both):
     first, second = both
     for i in range(3):
         first.turn(1.0 + i * PERIOD, FAST)
-    first.wheels.held = Lost(1.0, stuck=True)  # what was written then had left, and nothing since
+    first.wheels.held = Sent(1.0, lost=True, stuck=True)  # what was written then had left, and nothing since
     assert not first.turn(1.06, FAST)
-    assert first.board.newest() == LastCommand(first.wheels.told[0], 1.0)
+    assert first.board.newest().told == LastCommand(first.wheels.told[0], 1.0)
     assert second.turn(1.07) is False
     assert second.turn(1.09) is True
     assert second.wheels.told[-1].linear == pytest.approx(0.4 - 2.0 * 0.09), "from what they were told really"
     first.turn(1.1, FAST)  # sees that, as if they were told so
-    second.wheels.held = Lost(-1.0, stuck=True)
+    second.wheels.held = Sent(-1.0, lost=True, stuck=True)
     assert not second.turn(1.11)
-    assert second.board.newest().at == 1.0
+    assert second.board.newest().told.at == 1.0
     assert not first.turn(1.12, FAST)
     first.wheels.held = None
     assert any(first.turn(1.16 + i * PERIOD, FAST) for i in range(5))
     assert first.wheels.told[-1] == STANDSTILL, "they have heard nothing for longer than they turn"
 
 
+def test_what_goes_on_from_something_leaves_while_the_wheels_turn_by_that_or_never(both):
+    """The first stood still, and its program had before; what the second said left 0.17 s after what they heard."""
+    first, second = both
+    first.turn(1.0, FAST)
+    first.wheels.held = Sent(1.0)
+    for i in range(1, 3):
+        assert first.turn(1.0 + i * PERIOD, FAST)
+    assert first.wheels.untils[-1] == pytest.approx(1.0 + PATIENCE)
+    second.wheels.held = Sent(-inf)
+    assert not second.turn(1.075)
+    assert second.turn(1.091)
+    assert second.wheels.told[-1].linear > 0
+    assert second.wheels.untils[-1] == pytest.approx(1.0 + PATIENCE), "whatever was told after it may not have left"
+    assert not second.turn(1.111), "whether they turn or stand nobody knows"
+    assert second.turn(1.2) and second.wheels.told[-1] == STANDSTILL and second.wheels.untils[-1] == inf
+
+
+def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_left(both):
+    first, _ = both
+    first.wheels.held = Sent(-inf)
+    assert first.turn(2.0, FAST) and first.wheels.told == [STANDSTILL]
+    assert first.turn(2.02, FAST) and first.wheels.told[-1].linear > 0
+    assert first.wheels.untils == [inf, pytest.approx(2.0 + PATIENCE)]
+    first.wheels.held = Sent(2.02)
+    assert first.turn(2.04, FAST) and first.wheels.untils[-1] == pytest.approx(2.02 + PATIENCE)
+
+
 def test_what_could_not_be_published_the_wheels_were_not_told_and_are_told_to_stand_first(both):
     """Publishing failed for 2 s, and the first that did not was full speed."""
     first, _ = both
     first.turn(1.0, FAST)
-    first.wheels.held = Lost(1.0, stuck=False)
+    first.wheels.held = Sent(1.0, lost=True)
     for i in range(1, 20):
         assert first.turn(1.0 + i * PERIOD, FAST)
     assert first.wheels.told[-1] == STANDSTILL
@@ -322,8 +351,8 @@ def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
     for i in range(5):
         before.turn(1.0 + i * PERIOD)
     after = One(file, Role.SECOND)
-    assert after.board.of(Role.SECOND) == (LastCommand(STANDSTILL, 1.08), 1.0)
-    after.board.put(Role.FIRST, Entry(LastCommand(FAST, 1.1)))
+    assert after.board.of(Role.SECOND) == (LastCommand(STANDSTILL, 1.08), 1.0, 1.08)
+    after.board.put(Role.FIRST, Entry(LastCommand(FAST, 1.1), left_at=1.1))
     assert not after.turn(1.12)
     assert isnan(after.board.of(Role.SECOND).claim)  # what a dead one has claimed is given back by the next
     os.close(file)
@@ -332,16 +361,16 @@ def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
 def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
     file = board.make()
     page = Board(file)
-    assert page.newest() == LastCommand()
+    assert page.newest().told == LastCommand()
     for at in (1.0, 2.0, 3.0):
         page.put(Role.FIRST, Entry(LastCommand(FAST, at), at))
     with mmap.mmap(file, 4096) as memory:  # as who dies while it writes leaves it
         memory[memory.find(struct.pack("<d", 3.0))] ^= 1
     assert page.of(Role.FIRST) == Entry(LastCommand(FAST, 2.0), 2.0)
     page.put(Role.FIRST, Entry(LastCommand(STANDSTILL, 4.0)))
-    assert page.newest() == LastCommand(STANDSTILL, 4.0)
+    assert page.newest().told == LastCommand(STANDSTILL, 4.0)
     page.put(Role.SECOND, Entry(LastCommand(FAST, 5.0)))
-    assert Board(file).newest() == LastCommand(FAST, 5.0)  # as another process sees it
+    assert Board(file).newest().told == LastCommand(FAST, 5.0)  # as another process sees it
     with pytest.raises(PermissionError):
         os.ftruncate(file, 0)
     os.close(file)

@@ -14,14 +14,14 @@ import signal
 import struct
 import time
 from enum import IntEnum
-from math import isfinite, nan
+from math import inf, isfinite, isnan, nan
 from typing import NamedTuple
 from zlib import crc32
 
 from .protocol import LastCommand
 from .velocity import Velocity
 
-_ENTRY = struct.Struct("<Qdddd")
+_ENTRY = struct.Struct("<Qddddd")
 _SUM = struct.Struct("<I")
 _SLOT = 64
 """Bytes between two entries: a line of the processor's cache each."""
@@ -50,6 +50,11 @@ class Entry(NamedTuple):
     told: LastCommand = LastCommand()
     claim: float = nan
     """Since when it wants to tell the wheels what the other one has told them so far [s]; NaN: it does not."""
+    left_at: float = -inf
+    """When the last was told that is known to have left, or the first after a standstill [s].
+
+    The wheels have heard something after that, or nothing since.
+    """
 
     @property
     def sign(self) -> float:
@@ -113,7 +118,7 @@ class Board:
         """Write down. Only one process at a time may have a role."""
         (first, _), (second, _) = self._at(role, 0), self._at(role, 1)
         place, count = (1, first) if first > second else (0, second)
-        data = _ENTRY.pack(count + 1, *entry.told.velocity, entry.told.at, entry.claim)
+        data = _ENTRY.pack(count + 1, *entry.told.velocity, entry.told.at, entry.claim, entry.left_at)
         start = _SLOT * (2 * role + place)
         self._page[start : start + _ENTRY.size + _SUM.size] = data + _SUM.pack(crc32(data))
 
@@ -121,10 +126,10 @@ class Board:
         """What somebody wrote down last."""
         return max(self._at(role, 0), self._at(role, 1), key=lambda found: found[0])[1]
 
-    def newest(self) -> LastCommand:
-        """What the wheels were told last, by whomever."""
-        first, second = self.of(Role.FIRST).told, self.of(Role.SECOND).told
-        return first if not second.at >= first.at else second
+    def newest(self) -> Entry:
+        """Of who told the wheels something last."""
+        first, second = self.of(Role.FIRST), self.of(Role.SECOND)
+        return first if isnan(second.told.at) or second.told.at < first.told.at else second
 
     def place(self, role: Role) -> Place:
         """Where those of a role lock."""
@@ -140,8 +145,8 @@ class Board:
         data = self._page[start : start + _ENTRY.size + _SUM.size]
         if _SUM.unpack_from(data, _ENTRY.size)[0] != crc32(data[: _ENTRY.size]):
             return 0, Entry()
-        count, linear, angular, at, claim = _ENTRY.unpack_from(data)
-        return count, Entry(LastCommand(Velocity(linear, angular), at), claim)
+        count, linear, angular, at, claim, left_at = _ENTRY.unpack_from(data)
+        return count, Entry(LastCommand(Velocity(linear, angular), at), claim, left_at)
 
 
 def make() -> int:

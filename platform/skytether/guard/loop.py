@@ -249,7 +249,7 @@ class Guard:
         try:
             if isinstance(self._wheels, WriterWheels):
                 self._wheels.receive()
-                self._watch.learn(self._board.newest())
+                self._watch.learn(self._board.newest().told)
                 self._wheels.write(*self._watch.asks(now, stopped))
                 if self._wheels.trouble:
                     kind = "unread"

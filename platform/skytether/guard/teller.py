@@ -10,7 +10,8 @@ the other one has either seen that or cannot speak any more:
   the second sees the claim and gives way. Sooner than that it simply speaks: the second sees it in time.
 - Nobody speaks by a look at the board that is older than `LATE` periods: after a freeze in between it looks again.
 - Where another process sends what is written, and stands still or fails, the wheels were told what had left before
-  that, and whoever is next goes on from there.
+  that, and whoever is next goes on from there. What goes on from something leaves while the wheels turn by what is
+  known to have left, or never: after that they stand.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -28,7 +29,7 @@ from __future__ import annotations
 import errno
 from collections import deque
 from collections.abc import Callable
-from math import isnan, nan
+from math import inf, isnan, nan
 from typing import NamedTuple, Protocol
 
 from .board import Board, Entry, Role
@@ -63,20 +64,26 @@ def repeat_s(period_s: float, patience_s: float) -> float:
     return min(max(patience_s - 3 * period_s, 1.25 * period_s), 2 * period_s)
 
 
-class Lost(NamedTuple):
-    """What was written has not left, and never will."""
+class Sent(NamedTuple):
+    """How far what was written has come, where another process sends it."""
 
     left_at: float
-    """When the last was written that did [s]."""
-    stuck: bool
+    """When the last was written that is known to have left [s]."""
+    lost: bool = False
+    """What was written after it never does."""
+    stuck: bool = False
     """Who sends it stands still: nothing can be written now."""
 
 
 class Wheels(Protocol):
     """Where velocities go."""
 
-    def write(self, velocity: Velocity) -> None:
+    def write(self, velocity: Velocity, until: float = inf) -> None:
         """What the wheels do until the next call. Returns at once.
+
+        Args:
+            velocity: Of the robot.
+            until: If it has not left by then, it never does [s].
 
         Raises:
             BlockingIOError: What was sent before waits to be read, and there is no room for more.
@@ -97,8 +104,8 @@ class Wheels(Protocol):
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
-    def lost_after(self) -> Lost | None:
-        """Whether what was written last is known not to have left; None: it is not."""
+    def sent(self) -> Sent | None:
+        """How far what was written has come; None: what was written has left."""
         ...
 
 
@@ -125,7 +132,7 @@ class Teller:
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers = False
-        self._lost: Lost | None = None
+        self._sent: Sent | None = None
         self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
         """The newest last."""
         self.unread = ""
@@ -134,20 +141,21 @@ class Teller:
         """Whether a process was ended at the last attempt, in words; empty: none was."""
         self._broken_at = nan
         self._full_at = nan
-        self._own, self._claim = board.of(role)  # of who had the role before
+        self._own, self._claim, self._left_at = board.of(role)  # of who had the role before
+        self._heard_at = -inf
+        """As `board.Entry.left_at`, of whoever told the wheels something last."""
 
     def refresh(self) -> None:
         """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
-        lost, before = self._wheels.lost_after(), self._lost
-        self._lost = lost
-        if lost:
-            self._take_back(lost.left_at)
+        before, self._sent = self._sent, self._wheels.sent()
+        self._see_left()
         newest = self._board.newest()
-        if lost or before:
-            self._watch.told = newest  # what was learned may have been taken back
+        if (self._sent and self._sent.lost) or (before and before.lost):
+            self._watch.told = newest.told  # what was learned may have been taken back
         else:
-            self._watch.learn(newest)
-        if lost and lost.stuck:
+            self._watch.learn(newest.told)
+        self._heard_at = self._left_at if newest.told == self._own else newest.left_at
+        if self._is_stuck():
             return
         known, self._listeners = self._listeners, self._wheels.listeners()
         self._strangers = bool(self._listeners) and not (known and self._listeners and known & self._listeners)
@@ -169,8 +177,7 @@ class Teller:
             Exception: This way to them is broken. It counts as silence.
         """
         self.ended = ""
-        stuck = self._lost is not None and self._lost.stuck
-        unheard = stuck or (self._listeners is not None and not self._listeners)
+        unheard = self._is_stuck() or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
         if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:
@@ -184,11 +191,13 @@ class Teller:
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
             pid = self._board.place(other).end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
-        at = self._clock()
-        if at - now > LATE * self._period_s or not self._may(at):
+        at, until = self._clock(), inf
+        if self._watch.goes_on(now):
+            until = self._heard_at + self._watch.patience_s
+        if at - now > LATE * self._period_s or at > until or not self._may(at):
             return False
         try:
-            self._wheels.write(velocity)
+            self._wheels.write(velocity, until)
         except BlockingIOError:
             self._full_at = at
             raise BlockingIOError(errno.EAGAIN, _UNREAD) from None
@@ -200,6 +209,7 @@ class Teller:
             raise
         self._watch.wrote(velocity, now)
         self._written.append(self._watch.told)
+        self._left_at = self._heard_at if self._sent and until < inf else now
         self._put(self._watch.told)
         return True
 
@@ -246,20 +256,32 @@ class Teller:
             self._put(self._own, at)
         return at >= self._claim + LATE * self._period_s
 
-    def _take_back(self, left_at: float) -> None:
-        """What was written after what left, the wheels were not told, and never are: it is too old by then."""
-        while self._written and self._written[-1].at > left_at:
+    def _is_stuck(self) -> bool:
+        return self._sent is not None and self._sent.stuck
+
+    def _see_left(self) -> None:
+        """What was written after what left, the wheels may not have been told; or never are: it is too old by then."""
+        sent = self._sent
+        if sent is None:
+            return
+        self._left_at = max(self._left_at, min(sent.left_at, self._own.at))
+        if not sent.lost:
+            return
+        while self._written and self._written[-1].at > sent.left_at:
             self._written.pop()
-        if self._own.at > left_at:
-            self._put(self._written[-1] if self._written else LastCommand())
+        if self._own.at > sent.left_at:
+            told = self._written[-1] if self._written else LastCommand()
+            self._left_at = min(self._left_at, told.at)
+            self._put(told)
 
     def _failed(self, now: float) -> None:
         self._watch.failed(now)
+        self._left_at = self._heard_at = now
         self._put(self._watch.told)
 
     def _put(self, told: LastCommand, claim: float | None = None) -> None:
         self._own, self._claim = told, self._claim if claim is None else claim
-        self._board.put(self._role, Entry(self._own, self._claim))
+        self._board.put(self._role, Entry(self._own, self._claim, self._left_at))
 
 
 _OTHER = {Role.FIRST: Role.SECOND, Role.SECOND: Role.FIRST}

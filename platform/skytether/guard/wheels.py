@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import select
 import socket
+from math import inf
 
 from .descriptors import receive
 from .folder import check_listener
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
-from .teller import Lost
+from .teller import Sent
 from .velocity import Velocity
 
 Address = str | tuple[str, int]
@@ -28,8 +29,9 @@ class SocketWheels:
         self._address = address
         self._socket: socket.socket | None = None
 
-    def write(self, velocity: Velocity) -> None:
-        """Wheels: send it."""
+    def write(self, velocity: Velocity, until: float = inf) -> None:
+        """Wheels: send it, now or never."""
+        del until
         if self._socket is None:
             self._socket = _connected(self._address)
         try:
@@ -53,8 +55,8 @@ class SocketWheels:
         """Wheels: not known; a driver that does not read has no room left."""
         return ""
 
-    def lost_after(self) -> Lost | None:
-        """Teller's Wheels: nobody else sends it."""
+    def sent(self) -> Sent | None:
+        """Wheels: nobody else sends it."""
         return None
 
     def listeners(self) -> frozenset[str] | None:

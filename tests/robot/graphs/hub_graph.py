@@ -136,7 +136,7 @@ class HubWheels:
         self._node = Node(way.port)
         self.close = self._node.close
 
-    def write(self, velocity) -> None:
+    def write(self, velocity, until=0.0) -> None:
         twist = Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
         self._node.publish(self._topic, encode(twist))
 
@@ -146,7 +146,7 @@ class HubWheels:
     def full(self) -> bool:
         return False
 
-    def lost_after(self) -> None:
+    def sent(self) -> None:
         return None
 
     def unread(self) -> str:

@@ -76,8 +76,13 @@ class Publication(Handle, Protocol):
         """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
         ...
 
-    def put(self, payload: bytes | memoryview) -> bool:
-        """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
+    def put(self, payload: bytes | memoryview, until: float = inf) -> bool:
+        """Publish one serialised message; from any thread, returns at once. False if it was dropped.
+
+        Args:
+            payload: The message.
+            until: After that it is not published any more, where it has ``fresh_s`` [s].
+        """
         ...
 
 

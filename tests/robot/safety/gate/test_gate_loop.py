@@ -49,10 +49,10 @@ class Hardware:
     def read(self) -> list[tuple[str, Message]]:
         return [("scan", SCAN), *self.more]
 
-    def write(self, velocity: Velocity) -> None:
+    def write(self, velocity: Velocity, until: float = 0.0) -> None:
         self.told.append(velocity)
 
-    def lost_after(self) -> None:
+    def sent(self) -> None:
         return None
 
     def unread(self) -> str:
@@ -113,7 +113,7 @@ class Bench:
         except BlockingIOError:
             pass
         if answered:
-            self.board.put(Role.FIRST, Entry(LastCommand(told or beat.velocity, self.now)))
+            self.board.put(Role.FIRST, Entry(LastCommand(told or beat.velocity, self.now), left_at=self.now))
             self.guard.send(pack_answer(self.answer._replace(at=self.now)))
         return beat.velocity
 
@@ -190,9 +190,9 @@ def test_a_guard_that_tells_the_wheels_nothing_makes_the_gate_brake_the_wheels_i
     steps = [before - after for before, after in pairwise(told)]
     assert all(step <= 0.02 + 1e-9 for step in steps)
     assert told[-1] == 0.0
-    assert bench.board.newest() == LastCommand(STANDSTILL, bench.now)
+    assert bench.board.newest().told == LastCommand(STANDSTILL, bench.now)
     assert any("nobody else tells" in note for note in bench.notes)
-    bench.board.put(Role.FIRST, Entry(LastCommand(STANDSTILL, bench.now)))
+    bench.board.put(Role.FIRST, Entry(LastCommand(STANDSTILL, bench.now), left_at=bench.now))
     bench.turn()
     count = len(bench.hardware.told)
     bench.link.send(Velocity(0.2, 0.0))
@@ -236,7 +236,7 @@ def test_a_guard_that_is_frozen_while_its_writer_tells_the_wheels_leaves_them_to
     drive(bench)
     for _ in range(20):
         bench.turn(answered=False)
-        bench.board.put(Role.FIRST, Entry(LastCommand(Velocity(0.1, 0.0), bench.now)))
+        bench.board.put(Role.FIRST, Entry(LastCommand(Velocity(0.1, 0.0), bench.now), left_at=bench.now))
     assert not bench.hardware.told
 
 

@@ -35,10 +35,10 @@ class Way:
     def __init__(self, stage, who):
         self.stage, self.who = stage, who
 
-    def write(self, velocity):
+    def write(self, velocity, until):
         self.stage.told.append((self.stage.now, self.who, velocity))
 
-    def lost_after(self):
+    def sent(self):
         return None
 
     def unread(self):
@@ -118,7 +118,7 @@ class Stage:
             with suppress(BlockingIOError):
                 self.from_gate.send(pack_answer(Answer(self.now)))
         self.guard.receive()
-        self.guard_watch.learn(self.board.newest())
+        self.guard_watch.learn(self.board.newest().told)
         with suppress(OSError):
             self.guard.write(*self.guard_watch.asks(self.now))
         self.due["guard"] = self.guard_watch.due(self.now, 2 * PERIOD)

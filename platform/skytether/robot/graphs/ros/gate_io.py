@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from skytether.control.admittance import Velocity
-from skytether.guard.teller import Lost
+from skytether.guard.teller import Sent
 from skytether.messages import Message, Twist, Vector3
 
 from ..inbox import Inbox
@@ -73,7 +73,7 @@ class RosWheels(RosGateNode[Node]):
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
 
-    def lost_after(self) -> Lost | None:
+    def sent(self) -> Sent | None:
         """Wheels: nobody else sends it."""
         return None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
+from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.guard.board import Place
@@ -59,9 +60,9 @@ class Ros1Wheels(RosWheels[Node]):
             name = resolve(enable_topic, way.namespace)
             self._enable = self._node.advertise(name, Bool.TYPE, hash_of(Bool.TYPE, "ros1"), queue=1)
 
-    def write(self, velocity: Velocity) -> None:
+    def write(self, velocity: Velocity, until: float = inf) -> None:
         """Wheels: publish it."""
-        self._publication.publish(encode(twist_of(velocity), "ros1"), boottime() + self._fresh_s)
+        self._publication.publish(encode(twist_of(velocity), "ros1"), min(until, boottime() + self._fresh_s))
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""

@@ -13,7 +13,7 @@ from math import inf
 
 from skytether.control.admittance import Velocity
 from skytether.guard.board import Place
-from skytether.guard.teller import Lost
+from skytether.guard.teller import Sent
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
@@ -70,14 +70,14 @@ class Ros2Wheels(RosWheels[GraphNode]):
             name = resolve(enable_topic, way.namespace)
             self._enable = publish(_endpoint(Kind.PUBLISHER, name, Bool.TYPE))
 
-    def write(self, velocity: Velocity) -> None:
+    def write(self, velocity: Velocity, until: float = inf) -> None:
         """Wheels: publish it."""
         twist = twist_of(velocity)
         if self._way.cmd_vel_type == TwistStamped.TYPE:
             header = Header(Time.from_seconds(self._clock()), self._way.frame)
-            self._publication.put(encode(TwistStamped(header, twist)))
+            self._publication.put(encode(TwistStamped(header, twist)), until)
         else:
-            self._publication.put(encode(twist))
+            self._publication.put(encode(twist), until)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""
@@ -102,12 +102,12 @@ class Ros2Wheels(RosWheels[GraphNode]):
         # Beside a recorder, say, the wheels' node may have been started again.
         return frozenset(f"{life} {self._publication.renewed}" for life in lives)
 
-    def lost_after(self) -> Lost | None:
-        """Wheels: what the program has not published in time, or cannot."""
+    def sent(self) -> Sent:
+        """Wheels: what the program has published, or cannot."""
         stuck = self._publication.stuck
         if stuck and self._place is not None:  # who would take over may be dead
             self._place.end_speaker(self._speaks_s)
-        return Lost(self._publication.left_at, stuck) if stuck or self._publication.lost else None
+        return Sent(self._publication.left_at, stuck or self._publication.lost, stuck)
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

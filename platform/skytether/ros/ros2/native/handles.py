@@ -138,8 +138,8 @@ class Publication(Handle):
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
-    def put(self, payload: bytes | memoryview) -> bool:
-        """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
+    def put(self, payload: bytes | memoryview, until: float = inf) -> bool:
+        """See `skytether.ros.ros2.seam.Publication.put`."""
         body = bytes(payload)
         if self.endpoint.qos.transient_local:
             self._kept = body
@@ -149,7 +149,7 @@ class Publication(Handle):
                 self.dropped += 1
             return False
         if self._fresh_s < inf:  # what becomes of each the program tells, or its end
-            sender.put(self._fresh(body))
+            sender.put(self._fresh(body, until))
             return True
         pushed_out = sender.put(Frame(Kind.DATA, self.channel, body))  # an older one of this topic
         self.dropped += pushed_out
@@ -177,11 +177,11 @@ class Publication(Handle):
         """See `skytether.ros.ros2.seam.Publication.heard`; known once a message with `fresh_s` was published."""
         return self._heard
 
-    def _fresh(self, body: bytes) -> Frame:
+    def _fresh(self, body: bytes, until: float) -> Frame:
         with self._lock:
             number, now = next(self._numbers), _now()
             self._waiting.append((number, now))
-            until = min(now + self._fresh_s, self._waiting[0][1] + self._stuck_s)
+            until = min(until, now + self._fresh_s, self._waiting[0][1] + self._stuck_s)
             return fresh(self.channel, number, until, self._heard, body)
 
     def on_frame(self, frame: Frame) -> None:
