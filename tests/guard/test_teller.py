@@ -65,13 +65,13 @@ class One:
         self.late = 0.0
         self.now = nan
         self.teller = Teller(self.wheels, self.watch, self.board, role, PERIOD, lambda: self.now + self.late)
-        self.teller.refresh()
+        self.teller.refresh(self.now)
 
     def turn(self, now, wanted=None, stopped=False):
         self.now = now
         if wanted is not None:
             self.watch.on_beat(Beat(now, wanted))
-        self.teller.refresh()
+        self.teller.refresh(self.now)
         return self.teller.write_velocity(now, stopped)
 
 
@@ -152,6 +152,32 @@ def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_lef
     assert first.wheels.untils == [inf, pytest.approx(2.0 + PATIENCE)]
     first.wheels.held = Sent(2.02)
     assert first.turn(2.04, FAST) and first.wheels.untils[-1] == pytest.approx(2.02 + PATIENCE)
+
+
+def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):
+    """The wheels' subscription was made anew just before the first was held up: their first word was 0.4 m/s."""
+    first, second = both
+    for one in (first, second):
+        one.wheels.held = Sent(1.0)
+    assert first.turn(1.0, FAST)
+    first.turn(1.02, FAST)
+    first.wheels.held = Sent(1.0, lost=True)  # its program knew of the one who came
+    second.wheels.nodes = frozenset({"/base again"})
+    assert not second.turn(1.055)
+    assert second.turn(1.071)
+    assert second.wheels.told == [STANDSTILL]
+
+
+def test_who_takes_over_goes_on_where_the_other_one_has_told_who_came(both):
+    first, second = both
+    for one in (first, second):
+        one.wheels.nodes = frozenset({"/base again"})
+    second.turn(0.99)
+    for i in range(16):
+        first.turn(1.0 + i * PERIOD, FAST)
+    assert not second.turn(1.335)
+    assert second.turn(1.351)
+    assert second.wheels.told[-1].linear == pytest.approx(0.3 - 2.0 * 0.051)
 
 
 def test_what_could_not_be_published_the_wheels_were_not_told_and_are_told_to_stand_first(both):

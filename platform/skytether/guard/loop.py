@@ -255,7 +255,7 @@ class Guard:
                     kind = "unread"
                     raise OSError(self._wheels.trouble)
             else:
-                self._wheels.refresh()
+                self._wheels.refresh(now)
                 told = self._wheels.write_velocity(now, stopped)
             self._troubles.pop("wheels", None)
         except OSError as error:  # tried again in a moment; a motor drive that hears nothing stops by itself

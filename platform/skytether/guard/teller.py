@@ -131,7 +131,10 @@ class Teller:
         self._period_s = period_s
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
-        self._strangers = False
+        self._new = False
+        """Whether somebody listens, and nobody did in the turn before, as far as this one knew."""
+        self._strangers_at = -inf
+        """When others came in the place of all who had listened [s]."""
         self._sent: Sent | None = None
         self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
         """The newest last."""
@@ -145,8 +148,12 @@ class Teller:
         self._heard_at = -inf
         """As `board.Entry.left_at`, of whoever told the wheels something last."""
 
-    def refresh(self) -> None:
-        """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not."""
+    def refresh(self, now: float) -> None:
+        """See what the wheels were told, and who listens; once in each turn, whether they are told anything or not.
+
+        Args:
+            now: [s]
+        """
         before, self._sent = self._sent, self._wheels.sent()
         self._see_left()
         newest = self._board.newest()
@@ -158,7 +165,9 @@ class Teller:
         if self._is_stuck():
             return
         known, self._listeners = self._listeners, self._wheels.listeners()
-        self._strangers = bool(self._listeners) and not (known and self._listeners and known & self._listeners)
+        self._new = bool(self._listeners) and not known
+        if self._listeners and known and not known & self._listeners:
+            self._strangers_at = now
 
     def write_velocity(self, now: float, stopped: bool = False) -> bool:
         """Tell the wheels once what the watch has for them. `refresh` comes before.
@@ -180,8 +189,9 @@ class Teller:
         unheard = self._is_stuck() or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
-        if self._strangers and not self._board.of(_OTHER[self._role]).told.at >= self._own.at:
-            self._failed(now)  # they know nothing of what was told before, and nobody else has told them
+        alone = self._new and not self._board.of(_OTHER[self._role]).told.at >= self._own.at
+        if alone or self._strangers_at > self._heard_at:
+            self._failed(now)  # they know nothing of what was told before, and nobody else has told them since
         if not stopped and self._waits(now):
             return False
         self.unread = self._wheels.unread()

@@ -127,6 +127,27 @@ def test_who_begins_to_listen_after_somebody_has_left_counts():
     run(work)
 
 
+def test_what_was_wanted_before_somebody_came_is_no_first_word_for_him():
+    async def work(publication, connect):
+        _, first, _ = await connect(callerid="/base")
+        while not publication.subscribers:
+            await asyncio.sleep(0.001)
+        first.close()
+        while publication.subscribers:
+            await asyncio.sleep(0.001)
+        before = publication.renewed
+        reader, second, _ = await connect(callerid="/base")
+        while not publication.subscribers:
+            await asyncio.sleep(0.001)
+        publication.publish(b"fast", renewed=before)
+        publication.publish(b"stand", renewed=publication.renewed)
+        publication.publish(b"goes on", renewed=publication.renewed)
+        assert [await read_frame(reader), await read_frame(reader)] == [b"stand", b"goes on"]
+        second.close()
+
+    run(work)
+
+
 def test_where_it_is_known_who_turns_the_wheels_nobody_else_counts():
     async def work(publication, connect):
         for name, renewed in (("/tool", 0), ("/tool", 0), ("/base", 1), ("/tool", 1), ("/base", 2)):

@@ -145,7 +145,7 @@ class Publication:
         self._lock = threading.Lock()
         self._speaking = speaking
         self._clock = clock
-        self._handover: deque[_Frame] = deque(maxlen=_HANDOVER)
+        self._handover: deque[tuple[_Frame, int | None]] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self.renewed = 0
         self._comers = Comers(awaited)
@@ -156,24 +156,26 @@ class Publication:
         """Names of the nodes that listen now."""
         return [subscriber.caller for subscriber in list(self._subscribers)]
 
-    def publish(self, payload: bytes | memoryview, until: float = inf) -> None:
+    def publish(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> None:
         """Send a serialised message to everybody who listens; never blocks.
 
         Args:
             payload: The message.
             until: Not sent after that [s, `skytether.guard.clock.now`]: another thread sends it, which may stand still
                 meanwhile.
+            renewed: Nor once `renewed` is more than that: it would be a first word for who came.
         """
         frame = pack_frame(payload)
         with self._lock:
             first = not self._handover
-            self._handover.append((frame, until))
+            self._handover.append(((frame, until), renewed))
         if first:
             self._soon(self._flush)
 
     def _flush(self) -> None:
         with self._lock:
-            frames, self._handover = self._handover, deque(maxlen=_HANDOVER)
+            waiting, self._handover = self._handover, deque(maxlen=_HANDOVER)
+        frames = [frame for frame, renewed in waiting if renewed is None or renewed == self.renewed]
         if not frames:
             return
         if self._latched:
@@ -202,14 +204,17 @@ class Publication:
             if time.monotonic() < until:
                 subscriber.send(frame)
         self._subscribers.append(subscriber)
-        self.renewed += self._comers.is_anybody_back(self.subscribers)
+        self.renewed += self._is_anybody_back()
         try:
             while await reader.read(4096):
                 pass
         finally:
             self._subscribers.remove(subscriber)
-            self._comers.is_anybody_back(self.subscribers)
+            self._is_anybody_back()
             subscriber.close()
+
+    def _is_anybody_back(self) -> bool:
+        return self._comers.is_anybody_back({each: each.caller for each in self._subscribers})
 
     def _refusal(self, caller: str, header: dict[str, str]) -> str:
         kind, md5 = header.get("type", ANY), header.get("md5sum", ANY)

@@ -99,7 +99,7 @@ class Publication(Handle):
     stuck = False
     unread_s = 0.0
     heard = True
-    renewed = 0
+    renewed = None
     lost = False
     left_at: float = inf
     waits = False
@@ -110,9 +110,9 @@ class Publication(Handle):
         self._using = threading.RLock()
         """A publisher of Zenoh's must not be undeclared while another thread puts something."""
 
-    def put(self, payload: bytes | memoryview, until: float = inf) -> bool:
+    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
-        del until  # nothing waits here
+        del until, renewed  # nothing waits here
         if self.endpoint.qos.transient_local:
             self._kept = payload
         sent = self._publisher is not None and not self.refused

@@ -62,8 +62,8 @@ class Publication(Handle, Protocol):
         ...
 
     @property
-    def renewed(self) -> int:
-        """How often who listens was not known to hear any more: somebody may have come in another's place."""
+    def renewed(self) -> int | None:
+        """How often somebody began to listen who is to hear a first word; None: it is not known."""
         ...
 
     @property
@@ -76,12 +76,13 @@ class Publication(Handle, Protocol):
         """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
         ...
 
-    def put(self, payload: bytes | memoryview, until: float = inf) -> bool:
+    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped.
 
         Args:
             payload: The message.
             until: After that it is not published any more, where it has ``fresh_s`` [s].
+            renewed: Nor once more have come than that; None: those that are known now, if somebody hears.
         """
         ...
 

@@ -13,14 +13,24 @@ class Publisher:
     def __init__(self):
         self.hearing = Hearing()
         self.now = 100.0
+        self.came = 0
+        self.before = ""
+        self.keys = []
 
-    def publish(self, listeners, read, ticks=1):
+    def publish(self, listeners, read, ticks=1, swapped=False, shown=True):
         """``listeners``: letters, each the name of a node; a space has none yet, a capital acknowledges nothing."""
+        if len(listeners) < len(self.keys):
+            gone = next(i for i, name in enumerate(self.before) if listeners[i : i + 1] != name)
+            del self.keys[gone : gone + len(self.keys) - len(listeners)]
+        new = 1 if swapped else len(listeners) - len(self.keys)
+        keys = self.keys[: len(self.keys) - swapped] + [self.came + i + 1 for i in range(new)]
+        self.came += new
+        self.before = listeners
+        self.keys = keys if shown else self.keys
+        nodes = {key: (name.strip(), not name.isupper()) for key, name in zip(self.keys, listeners, strict=True)}
         for _ in range(ticks):
             self.now += TICK
-            self.hearing.update(
-                len(listeners), read, self.now, lambda: [(name.strip(), not name.isupper()) for name in listeners]
-            )
+            self.hearing.update(len(listeners), self.came, read, self.now, lambda: nodes)
             self.hearing.tell(len(listeners), self.now)
         return self.hearing
 
@@ -113,3 +123,21 @@ def test_the_wheels_that_are_back_are_to_hear_a_first_word(publisher, listeners)
     assert publisher.hearing.heard == bool(listeners[-2])
     assert not publisher.publish(listeners[-1], True).heard
     assert publisher.publish(listeners[-1], True).heard
+
+
+@pytest.mark.parametrize("shown", [True, False], ids=["shown", "not shown by the graph yet"])
+def test_who_takes_anothers_place_between_two_messages_is_to_hear_a_first_word(publisher, shown):
+    """A driver's subscription was made anew within 2 ms, and the first that it heard was full speed."""
+    publisher.publish("rb", True, 5)
+    renewed = publisher.hearing.renewed
+    assert not publisher.publish("rb", True, swapped=True, shown=shown).heard
+    assert publisher.hearing.renewed == renewed + 1
+    assert publisher.publish("rb", True).heard
+
+
+def test_the_first_who_listens_is_to_hear_a_first_word_and_who_comes_to_watch_is_not(publisher):
+    assert publisher.publish("", True).renewed == 0
+    assert publisher.publish("b", True, 5).renewed == 1
+    assert publisher.publish("br", True, 5).renewed == 1
+    assert publisher.publish("", True, 5).renewed == 1
+    assert publisher.publish("b", True, 5).renewed == 2

@@ -49,6 +49,8 @@ class Ros1Wheels(RosWheels[Node]):
         topic = resolve(way.cmd_vel, way.namespace)
         speaking = Speaking(*place) if place else nullcontext
         self._nodes = [resolve(name, way.namespace) for name in way.wheels_nodes]
+        self._renewed: int | None = None
+        """How many had come at the last look."""
         self._publication = self._node.advertise(
             topic, Twist.TYPE, hash_of(Twist.TYPE, "ros1"), queue=1, speaking=speaking, awaited=self._nodes
         )
@@ -62,7 +64,8 @@ class Ros1Wheels(RosWheels[Node]):
 
     def write(self, velocity: Velocity, until: float = inf) -> None:
         """Wheels: publish it."""
-        self._publication.publish(encode(twist_of(velocity), "ros1"), min(until, boottime() + self._fresh_s))
+        until = min(until, boottime() + self._fresh_s)
+        self._publication.publish(encode(twist_of(velocity), "ros1"), until, self._renewed)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""
@@ -76,11 +79,10 @@ class Ros1Wheels(RosWheels[Node]):
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, of those that turn the wheels."""
         # Beside a recorder, say, the wheels' node may have been started again.
+        self._renewed = self._publication.renewed  # before them: who comes meanwhile counts as new
         names = self._publication.subscribers
         self._look_for(self._nodes, names, self._publication.topic)
-        return frozenset(
-            f"{name} {self._publication.renewed}" for name in names if not self._nodes or name in self._nodes
-        )
+        return frozenset(f"{name} {self._renewed}" for name in names if not self._nodes or name in self._nodes)
 
 
 class Ros1Sensors(RosSensors[Node]):

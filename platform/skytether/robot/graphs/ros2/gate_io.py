@@ -65,6 +65,8 @@ class Ros2Wheels(RosWheels[GraphNode]):
         if role == "gate":
             own = [resolve(f"{way.node}_guard", way.namespace)]  # this node does not see itself
             self._watch = WheelsWatch(self._topic, own, self._publishers)
+        self._renewed: int | None = None
+        """How many had come at the last look."""
         self._enable = None
         if enable_topic:
             name = resolve(enable_topic, way.namespace)
@@ -75,9 +77,9 @@ class Ros2Wheels(RosWheels[GraphNode]):
         twist = twist_of(velocity)
         if self._way.cmd_vel_type == TwistStamped.TYPE:
             header = Header(Time.from_seconds(self._clock()), self._way.frame)
-            self._publication.put(encode(TwistStamped(header, twist)), until)
+            self._publication.put(encode(TwistStamped(header, twist)), until, self._renewed)
         else:
-            self._publication.put(encode(twist), until)
+            self._publication.put(encode(twist), until, self._renewed)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""
@@ -96,11 +98,14 @@ class Ros2Wheels(RosWheels[GraphNode]):
         if self._publication.refused:
             return frozenset()
         lives = self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes)
+        self._renewed = self._publication.renewed
         if self._nodes:
             there = [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.SUBSCRIPTION)]
             self._look_for(self._nodes, there, self._topic)
-        # Beside a recorder, say, the wheels' node may have been started again.
-        return frozenset(f"{life} {self._publication.renewed}" for life in lives)
+        if self._renewed is None:
+            return frozenset(lives)
+        # When who comes, or comes in another's place, is to hear a first word, who publishes knows sooner.
+        return frozenset({str(self._renewed)} if lives else ())
 
     def sent(self) -> Sent:
         """Wheels: what the program has published, or cannot."""

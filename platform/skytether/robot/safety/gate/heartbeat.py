@@ -58,11 +58,12 @@ class Heartbeat:
         self._period_s = period_s
         self._patience_s = patience_s
         self._teller = Teller(wheels, self._watch, board, Role.SECOND, period_s, clock)
+        self._clock = clock
         self._trouble = trouble
 
     def receive(self) -> None:
         """Take in what the guard answers, and what the wheels were told."""
-        self._teller.refresh()
+        self._teller.refresh(self._clock())
         for _ in range(_PACKETS):
             try:
                 data = self._guard.recv(LARGEST)

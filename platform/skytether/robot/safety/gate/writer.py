@@ -136,7 +136,7 @@ class Writer:
 
     def _write_velocity(self, now: float) -> bool:
         """Tell the wheels. False: not yet."""
-        self._teller.refresh()
+        self._teller.refresh(now)
         try:
             told = self._teller.write_velocity(now)
         except Exception as error:  # tried again in a moment

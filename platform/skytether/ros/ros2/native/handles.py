@@ -20,7 +20,7 @@ from ...velocities import VELOCITIES
 from ..dialect import Endpoint
 from ..qos import Qos, follow
 from .overrun import QUIET_S, Overrun
-from .side.frames import Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
+from .side.frames import FOR_ALL, Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)
@@ -138,7 +138,7 @@ class Publication(Handle):
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
-    def put(self, payload: bytes | memoryview, until: float = inf) -> bool:
+    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
         """See `skytether.ros.ros2.seam.Publication.put`."""
         body = bytes(payload)
         if self.endpoint.qos.transient_local:
@@ -149,7 +149,7 @@ class Publication(Handle):
                 self.dropped += 1
             return False
         if self._fresh_s < inf:  # what becomes of each the program tells, or its end
-            sender.put(self._fresh(body, until))
+            sender.put(self._fresh(body, until, renewed))
             return True
         pushed_out = sender.put(Frame(Kind.DATA, self.channel, body))  # an older one of this topic
         self.dropped += pushed_out
@@ -177,18 +177,19 @@ class Publication(Handle):
         """See `skytether.ros.ros2.seam.Publication.heard`; known once a message with `fresh_s` was published."""
         return self._heard
 
-    def _fresh(self, body: bytes, until: float) -> Frame:
+    def _fresh(self, body: bytes, until: float, renewed: int | None) -> Frame:
         with self._lock:
             number, now = next(self._numbers), _now()
             self._waiting.append((number, now))
             until = min(until, now + self._fresh_s, self._waiting[0][1] + self._stuck_s)
-            return fresh(self.channel, number, until, self._heard, body)
+            if renewed is None:
+                renewed = self.renewed if self._heard else FOR_ALL
+            return fresh(self.channel, number, until, renewed, body)
 
     def on_frame(self, frame: Frame) -> None:
-        number, unread_s, published, heard = pull_dealt_with(frame.body)
+        number, unread_s, published, heard, renewed = pull_dealt_with(frame.body)
         with self._lock:
-            self.renewed += self._heard and not heard
-            self._heard = heard
+            self._heard, self.renewed = heard, renewed
             self._unread = (_now(), unread_s)
             over = []
             while self._waiting and self._waiting[0][0] <= number:

@@ -7,11 +7,12 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - DATA: one serialised message;
 - REQUEST, RESPONSE: uint64 number of the call, serialised request or response;
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
-- FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, a bool, serialised message, which is published
-  until then or never, and where the bool is true only if all who listen are known to hear; from the node the number,
-  float64 seconds for which nobody has acknowledged what was published, uint64 how many of this topic were published so
-  far, and a bool, whether they are heard: this message, and those before it, wait no more. A velocity
-  of a subscription comes from the node as others go to it, and is taken until then or never.
+- FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, int64 for whom, serialised message, which is
+  published until then or never, and to nobody who came later: for whom is how often somebody had come who is to hear a
+  first word, or -1, and it is for all; from the node the number, float64 seconds for which nobody has acknowledged what
+  was published, uint64 how many of this topic were published so far, a bool, whether they are heard, and int64 how
+  often somebody came: this message, and those before it, wait no more. A velocity of a subscription comes from the node
+  as others go to it, and is taken until then or never.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from typing import Any, NamedTuple, Protocol
 
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
-FRESH = struct.Struct("<Qd?")
-_DEALT_WITH = struct.Struct("<QdQ?")
+FOR_ALL = -1
+"""A message that goes to whoever listens."""
+FRESH = struct.Struct("<Qdq")
+_DEALT_WITH = struct.Struct("<QdQ?q")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
@@ -85,17 +88,17 @@ def numbered(kind: Kind, channel: int, number: int, body: bytes) -> Frame:
     return Frame(kind, channel, NUMBER.pack(number) + body)
 
 
-def fresh(channel: int, number: int, until: float, heard: bool, body: bytes) -> Frame:
-    """A frame of a message that is published until then [s], or never; and if it is for who hears, to no other."""
-    return Frame(Kind.FRESH, channel, FRESH.pack(number, until, heard) + body)
+def fresh(channel: int, number: int, until: float, renewed: int, body: bytes) -> Frame:
+    """A frame of a message that is published until then [s], or never; and to nobody who came after so many."""
+    return Frame(Kind.FRESH, channel, FRESH.pack(number, until, renewed) + body)
 
 
-def pull_fresh(body: bytes) -> tuple[int, float, bool, bytes]:
-    """Number, time, whether it is for who hears, and message of `fresh`."""
+def pull_fresh(body: bytes) -> tuple[int, float, int, bytes]:
+    """Number, time, for whom, and message of `fresh`."""
     return *FRESH.unpack_from(body), body[FRESH.size :]
 
 
-def dealt_with(channel: int, number: int, unread_s: float, published: int, heard: bool) -> Frame:
+def dealt_with(channel: int, number: int, unread_s: float, published: int, heard: bool, renewed: int) -> Frame:
     """A frame of the node: it is done with a message of `fresh`, and all before it.
 
     Args:
@@ -104,14 +107,15 @@ def dealt_with(channel: int, number: int, unread_s: float, published: int, heard
         unread_s: For how long all before it are unread [s].
         published: How many of this topic were, so far.
         heard: Whether somebody listens, and everybody who does is known to hear, or has had the time to begin.
+        renewed: How often somebody began to listen who is to hear a first word.
     """
-    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published, heard))
+    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published, heard, renewed))
 
 
-def pull_dealt_with(body: bytes) -> tuple[int, float, int, bool]:
-    """Number, seconds, how many were published, and whether they are heard, of `dealt_with`."""
-    number, unread_s, published, heard = _DEALT_WITH.unpack(body)
-    return number, unread_s, published, heard
+def pull_dealt_with(body: bytes) -> tuple[int, float, int, bool, int]:
+    """All but the channel of `dealt_with`."""
+    number, unread_s, published, heard, renewed = _DEALT_WITH.unpack(body)
+    return number, unread_s, published, heard, renewed
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

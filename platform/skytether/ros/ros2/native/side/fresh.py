@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from . import graph
-from .frames import Frame, dealt_with
+from .frames import FOR_ALL, Frame, dealt_with
 from .hearing import Hearing
 
 FAREWELL_S = 0.3
@@ -51,34 +53,61 @@ class FreshPublisher:
         self._node, self._publisher, self._lifespan_s = node, publisher, lifespan_s
         self._speaking, self._now = speaking, now
         self._hearing = Hearing(awaited)
+        self._lock = threading.Lock()
+        """Of what is known of who hears, and was published."""
+        self._nodes = partial(graph.listeners, node, publisher.topic_name)
+        self._came = _count_matches(publisher)
         self._published, self._published_at = 0, now()
+        self._number = 0
         self._read = True
 
-    def publish(self, until: float, heeds: bool, body: bytes) -> None:
+    def publish(self, number: int, until: float, renewed: int, body: bytes) -> None:
         """Publish a message.
 
         Args:
+            number: What the agent calls it.
             until: Not after that [s].
-            heeds: It is no first word for somebody.
+            renewed: It is no first word for who came after so many; `FOR_ALL`: it may be.
             body: The message, serialised.
         """
+        published = False
+        try:
+            published = self._publish(until, renewed, body)
+        finally:
+            with self._lock:
+                self._number = number
+                self._published += published
+
+    def _publish(self, until: float, renewed: int, body: bytes) -> bool:
         hearing, publisher, now = self._hearing, self._publisher, self._now()
         if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
             self._read = _has_been_read(publisher, _AT_ONCE)
-        listeners = partial(graph.listeners, self._node, publisher.topic_name)
-        hearing.update(publisher.get_subscription_count(), self._read, now, listeners)
+        with self._lock:
+            came = self._came()
+            hearing.update(publisher.get_subscription_count(), came, self._read, now, self._nodes)
         with self._speaking():
-            new = self._now() <= until and (hearing.heard or not heeds)  # or he is, and it is no first word for him
+            known = renewed == FOR_ALL or (renewed == hearing.renewed and came == self._came())
+            new = bool(known and self._now() <= until)
             if new:
                 self._published_at = self._now()
                 publisher.publish(body)
         if new:
-            self._published += 1
-            hearing.tell(publisher.get_subscription_count(), self._now())
+            with self._lock:
+                hearing.tell(publisher.get_subscription_count(), self._now())
+        return new
 
-    def answer(self, channel: int, number: int) -> Frame:
-        """What the agent is told of one that was dealt with."""
-        return dealt_with(channel, number, self._hearing.unread_s, self._published, self._hearing.heard)
+    def look(self) -> bool:
+        """See who listens, while perhaps nothing is published; whether that is somebody who is to hear a first word."""
+        with self._lock:
+            before = self._hearing.renewed
+            self._hearing.look(self._publisher.get_subscription_count(), self._came(), self._now(), self._nodes)
+            return self._hearing.renewed != before
+
+    def answer(self, channel: int) -> Frame:
+        """What the agent is told of what was dealt with."""
+        hearing = self._hearing
+        with self._lock:
+            return dealt_with(channel, self._number, hearing.unread_s, self._published, hearing.heard, hearing.renewed)
 
     def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
         """Publish a last word until it is acknowledged.
@@ -113,6 +142,20 @@ class FreshPublisher:
         ours = (self._node.get_name(), self._node.get_namespace())
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
+
+
+def _count_matches(publisher: Any) -> Callable[[], int | None]:
+    """How often anybody began to listen to a publisher; None: not told, as by Humble.
+
+    A callback would be told by the executor, when something may have been published since.
+    """
+    try:
+        kind = rclpy_implementation.rcl_publisher_event_type_t.RCL_PUBLISHER_MATCHED
+        with publisher.handle:
+            event = rclpy_implementation.EventHandle(publisher.handle, kind)
+    except (AttributeError, rclpy_implementation.UnsupportedEventTypeError):
+        return lambda: None
+    return lambda: int(event.take_event().total_count)
 
 
 def _has_been_read(publisher: Any, within: Duration) -> bool:

@@ -88,15 +88,15 @@ def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
-def listeners(node: Any, topic: str) -> list[tuple[str, bool]]:
-    """Nodes that subscribe a topic, once for each subscription; empty where a name is not told, or not yet.
+def listeners(node: Any, topic: str) -> dict[str, tuple[str, bool]]:
+    """Who subscribes a topic: by subscription its node, empty where that is not told, or not yet.
 
     With each whether it acknowledges messages.
     """
-    return [
-        (_node(info), info.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
+    return {
+        _gid(info): (_node(info), info.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
         for info in node.get_subscriptions_info_by_topic(topic)
-    ]
+    }
 
 
 def others(node: Any) -> tuple[int, int]:

@@ -31,6 +31,7 @@ except ImportError:  # Humble
 
 from . import definitions, graph, types
 from .frames import (
+    FOR_ALL,
     SHUT_DOWN,
     Frame,
     Kind,
@@ -207,11 +208,10 @@ class Program:
                 publisher.publish(frame.body)
         elif frame.kind is Kind.FRESH:
             if (publication := self._fresh.get(frame.channel)) is not None:
-                number, until, heeds, body = pull_fresh(frame.body)
                 try:
-                    publication.publish(until, heeds, body)
+                    publication.publish(*pull_fresh(frame.body))
                 finally:  # or what waits for an answer would wait for ever
-                    self._sender.put(publication.answer(frame.channel, number))
+                    self._sender.put(publication.answer(frame.channel))
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -296,14 +296,18 @@ class Program:
             if self._stalls.is_old(channel, time.time() - sent / 1e9 if sent else None, _now()):
                 self._stale[channel] = self._stale.get(channel, 0) + 1
             else:
-                self._sender.put(fresh(channel, 0, _now() + STOOD_S, False, message))
+                self._sender.put(fresh(channel, 0, _now() + STOOD_S, FOR_ALL, message))
 
         return take if _TELLS_TIMES else lambda message: take(message, {"source_timestamp": 0})
 
     def _turn(self) -> None:
-        """Thread that sees this process stand still."""
+        """Thread that sees this process stand still, and who listens."""
         while not self._ended.wait(TURN_S):
             self._stalls.turn(_now())
+            for channel, publication in list(self._fresh.items()):
+                with contextlib.suppress(Exception):  # it is seen, and told, with what is published next
+                    if publication.look():
+                        self._sender.put(publication.answer(channel))
 
     def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
         self._names[channel] = name
