@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from skytether.guard import record, settings
 from skytether.guard.kinematics import Bounds
 from skytether.guard.log import Log
+from skytether.guard.protocol import pack_twist
 from skytether.guard.requests import Requests, readable
 from skytether.guard.velocity import Velocity
 from skytether.guard.wheels import SocketWheels
@@ -299,4 +300,17 @@ def test_a_driver_that_ends_and_comes_back_is_a_failed_write(tmp_path):
             wheels.write(Velocity(0.1, 0.0))
         wheels.write(Velocity(0.2, 0.0))
         assert len(second.recv(100)) == 52
+    wheels.close()
+
+
+def test_what_is_old_by_the_time_it_would_be_sent_is_not(tmp_path):
+    """The process stood still between its decision and the kernel."""
+    path = str(tmp_path / "wheels.sock")
+    wheels = SocketWheels(path, clock=lambda: 2.0)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as driver:
+        driver.bind(path)
+        with pytest.raises(TimeoutError, match="stood still"):
+            wheels.write(Velocity(0.5, 0.0), until=1.9)
+        wheels.write(Velocity(0.1, 0.0), until=2.1)
+        assert driver.recv(100) == pack_twist(Velocity(0.1, 0.0))
     wheels.close()

@@ -41,6 +41,8 @@ SILENT = 1.5
 """Periods. The gate speaks in every period, and the first answers it by telling the wheels."""
 LATE = 0.75
 """Periods."""
+FRESH = 1.5
+"""Periods. No older is what somebody else sends for who tells the wheels something when the other one may speak."""
 SPEAKS = 0.4
 """Periods. Who says something for longer stands still; less than `LATE`."""
 _SOON = 0.5
@@ -201,9 +203,10 @@ class Teller:
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
             pid = self._board.place(other).end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
-        at, until = self._clock(), inf
-        if self._watch.goes_on(now):
-            until = self._heard_at + self._watch.patience_s
+        at, goes_on = self._clock(), self._watch.goes_on(now)
+        until = at + FRESH * self._period_s  # from this look on: this process may stand still at any moment
+        if goes_on:
+            until = min(until, self._heard_at + self._watch.patience_s)
         if at - now > LATE * self._period_s or at > until or not self._may(at):
             return False
         try:
@@ -219,7 +222,7 @@ class Teller:
             raise
         self._watch.wrote(velocity, now)
         self._written.append(self._watch.told)
-        self._left_at = self._heard_at if self._sent and until < inf else now
+        self._left_at = self._heard_at if self._sent and goes_on else now
         self._put(self._watch.told)
         return True
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import select
 import socket
+from collections.abc import Callable
 from math import inf
 
+from .clock import now
 from .descriptors import receive
 from .folder import check_listener
 from .protocol import LARGEST, Beat, pack_beat, pack_twist, unpack_answer
@@ -23,17 +25,20 @@ class SocketWheels:
 
     Args:
         address: Of whoever turns the wheels; it may come later, and come again.
+        clock: `clock.now`; replaced by tests only.
     """
 
-    def __init__(self, address: Address) -> None:
+    def __init__(self, address: Address, clock: Callable[[], float] = now) -> None:
         self._address = address
+        self._clock = clock
         self._socket: socket.socket | None = None
 
     def write(self, velocity: Velocity, until: float = inf) -> None:
-        """Wheels: send it, now or never."""
-        del until
+        """Wheels: send it."""
         if self._socket is None:
             self._socket = _connected(self._address)
+        if self._clock() > until:
+            raise TimeoutError("this process stood still as it was about to tell them something")
         try:
             self._socket.send(pack_twist(velocity))
         except BlockingIOError:  # the same driver is there, and may read yet

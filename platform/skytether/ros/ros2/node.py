@@ -101,10 +101,15 @@ class Ros2Node(NodeBase):
         return self._add(publication)
 
     def subscribe(
-        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+        self,
+        endpoint: Endpoint,
+        take: Callable[[bytes], object],
+        *,
+        lose: Callable[[int], object] | None = None,
+        every_kept: bool = False,
     ) -> Subscription:
         """Be a subscription; the function gets each serialised message, in a thread of Zenoh's, which drops none."""
-        del lose
+        del lose, every_kept
         return self._add(Subscription(self, endpoint, take))
 
     def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:

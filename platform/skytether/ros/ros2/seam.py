@@ -134,7 +134,12 @@ class GraphNode(Protocol):
         ...
 
     def subscribe(
-        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+        self,
+        endpoint: Endpoint,
+        take: Callable[[bytes], object],
+        *,
+        lose: Callable[[int], object] | None = None,
+        every_kept: bool = False,
     ) -> Handle:
         """Be a subscription.
 
@@ -142,6 +147,8 @@ class GraphNode(Protocol):
             endpoint: Which.
             take: Gets each serialised message, one at a time, and must return at once.
             lose: Told how many messages, since it was last called, came too quickly to be taken.
+            every_kept: Take what some publishers keep for newcomers where others keep nothing, too: then messages of
+                those that do come twice.
         """
         ...
 

@@ -134,9 +134,11 @@ class Ros2Sensors(RosSensors[GraphNode]):
         super().__init__(_start(way, "sensors"), Inbox(topics, "cdr", trouble))
         for name, kind in topics.kinds.items():
             endpoint = _endpoint(Kind.SUBSCRIPTION, resolve(name, way.namespace), kind.TYPE)
-            if name in topics.stops:  # whatever the gate does meanwhile, none may be pushed out by a release
+            stops = name in topics.stops
+            if stops:  # whatever the gate does meanwhile, none may be pushed out by a release
                 endpoint = replace(endpoint, qos=replace(endpoint.qos, depth=_STOPS), priority=1)
-            self._node.subscribe(endpoint, partial(self._inbox.put, name))
+            # Of two buttons one may have been pressed before, and keep that for who comes.
+            self._node.subscribe(endpoint, partial(self._inbox.put, name), every_kept=stops)
 
 
 class Ros2Display(RosGateNode[GraphNode]):

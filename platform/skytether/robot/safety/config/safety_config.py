@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from skytether.guard import teller
 from skytether.guard.kinematics import Bounds
 from skytether.messages import Bool, Encoding, Message, String
 from skytether.robot.control.supervisor import VelocityLimits
@@ -253,7 +254,7 @@ class SafetyConfig(SourcesConfig):
         fastest = max(bounds.linear_max, -bounds.linear_min)
         braking = max(fastest / bounds.linear_braking, bounds.angular_max / bounds.angular_braking)
         stuck_s = max(1.5 * period, self.guard_s - 3.25 * period)
-        return WheelsTiming(self.guard_s, 1.5 * period, stuck_s, self.guard_s + 3 * period + braking)
+        return WheelsTiming(self.guard_s, teller.FRESH * period, stuck_s, self.guard_s + 3 * period + braking)
 
     def wheels_at(self) -> str:
         """Where the wheels are, in words that tell one robot's from another's."""

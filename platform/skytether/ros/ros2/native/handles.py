@@ -18,7 +18,7 @@ from skytether.bridge.calls import CallError
 
 from ...velocities import VELOCITIES
 from ..dialect import Endpoint
-from ..qos import Qos, follow
+from ..qos import Qos, follow, history_missed
 from .overrun import QUIET_S, Overrun
 from .side.frames import FOR_ALL, Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
 from .side.outbox import Sender
@@ -254,15 +254,18 @@ class Subscription(Handle):
         endpoint: Endpoint,
         take: Callable[[bytes], object],
         lose: Callable[[int], object] | None = None,
+        *,
+        every_kept: bool = False,
     ) -> None:
         super().__init__(host, channel, endpoint)
+        self._every_kept = every_kept
         self._on_message = take
         self._lose = lose
         self._lost = 0
         self._stale_at = -inf
         """When the last message came that had waited for one of our processes that stood still [s]."""
         self._overrun = Overrun(endpoint.qos.depth)
-        self._asked: Qos | None = None
+        self._asked: tuple[Qos, bool] | None = None
 
     def join(self, sender: Sender) -> None:
         self._asked = None
@@ -273,10 +276,11 @@ class Subscription(Handle):
         offers = [other.qos for other in others]
         kept_too = self.endpoint.type not in VELOCITIES  # of any age
         wanted = follow(self.endpoint.qos, offers, kept_too=kept_too) if offers else None
+        besides = self._every_kept and history_missed(offers)
         sender = self._sender
-        if sender is None or wanted is None or wanted == self._asked:
+        if sender is None or wanted is None or (wanted, besides) == self._asked:
             return
-        self._asked = wanted
+        self._asked = wanted, besides
         ours = self.endpoint
         sender.put(
             control(
@@ -289,6 +293,7 @@ class Subscription(Handle):
                 depth=wanted.depth,
                 priority=ours.priority,
                 keep=ours.qos.depth,
+                besides=besides,
             )
         )
 

@@ -145,10 +145,15 @@ class RclpyNode(NodeBase):
         )
 
     def subscribe(
-        self, endpoint: Endpoint, take: Callable[[bytes], object], *, lose: Callable[[int], object] | None = None
+        self,
+        endpoint: Endpoint,
+        take: Callable[[bytes], object],
+        *,
+        lose: Callable[[int], object] | None = None,
+        every_kept: bool = False,
     ) -> Subscription:
         """Be a subscription; the function gets each serialised message, in the node's thread."""
-        return self._add(Subscription(self, next(self._channels), endpoint, take, lose))
+        return self._add(Subscription(self, next(self._channels), endpoint, take, lose, every_kept=every_kept))
 
     def serve(self, endpoint: Endpoint, answer: Callable[[bytes], bytes]) -> Server:
         """Be a service; see `Server`."""

@@ -131,6 +131,8 @@ class Program:
         self._speaking: Callable[[], contextlib.AbstractContextManager[None]]
         self._speaking = Speaking(*place) if place else contextlib.nullcontext
         self._subscriptions: dict[int, Any] = {}
+        self._besides: dict[int, Any] = {}
+        """To what some publishers keep for newcomers, where others keep nothing."""
         self._servers: dict[int, _Server] = {}
         self._clients: dict[int, Any] = {}
         self._pending: dict[tuple[int, int], Any] = {}
@@ -264,6 +266,7 @@ class Program:
         depth: int,
         priority: int,
         keep: int,
+        besides: bool,
     ) -> None:
         """Subscribe, or again with another quality: the new one first, so that the graph is never without."""
         self._names[channel] = name
@@ -286,6 +289,12 @@ class Program:
         self._subscriptions[channel] = new
         if before is not None:
             self._node.destroy_subscription(before)
+        if besides and channel not in self._besides:
+            kept = graph.profile(True, True, depth)  # who does not acknowledge is told nothing of before
+            quiet = SubscriptionEventCallbacks(use_default_callbacks=False)  # others do not fit, as is known
+            self._besides[channel] = self._node.create_subscription(
+                cls, name, take, kept, raw=True, event_callbacks=quiet
+            )
 
     def _taker_of_velocities(self, channel: int) -> Callable[..., object]:
         """What `rclpy` calls with each."""
@@ -332,6 +341,7 @@ class Program:
         for thing, destroy in (
             (self._publishers.pop(channel, None), self._node.destroy_publisher),
             (self._subscriptions.pop(channel, None), self._node.destroy_subscription),
+            (self._besides.pop(channel, None), self._node.destroy_subscription),
             (self._clients.pop(channel, None), self._node.destroy_client),
             (server.service if server else None, self._node.destroy_service),
         ):
