@@ -184,7 +184,7 @@ def say(engine: Engine, sent: bytes, registries: tuple[str, ...] = ()) -> bytes:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             there = await asyncio.open_unix_connection(engine.path)
             try:
-                await splice((reader, writer), there, there=gate.pass_requests)
+                await splice((reader, writer), there, there=gate.of_link())
             finally:
                 there[1].transport.abort()
                 writer.transport.abort()
@@ -340,7 +340,7 @@ def test_an_engine_hears_of_an_archive_when_all_of_it_is_there(engine: Engine) -
         archive = tar(*GRANT, ("instance/grant.json", FILE, b"a" * 60_000))
         sent = request(f"PUT /containers/{ID}/archive?path=%2Frun%2Fskytether", archive)
         reader.feed_data(sent[:-1])
-        way = asyncio.create_task(gate.pass_requests((reader, engine_s), (reader, engine_s)))
+        way = asyncio.create_task(gate.of_link()((reader, engine_s), (reader, engine_s)))
         while reader._buffer:  # type: ignore[attr-defined]  # noqa: SLF001 asyncio's own
             await asyncio.sleep(0)
             if reader._waiter is not None:  # type: ignore[attr-defined]  # noqa: SLF001
@@ -869,7 +869,7 @@ def test_a_refusal_takes_one_line_of_the_log_and_many_take_few(
             reader = asyncio.StreamReader()
             reader.feed_data(request(f"GET /a{number}%0A%1b[31mfalse"))
             nobody = AsyncMock(asyncio.StreamWriter, write=Mock())
-            await gate.pass_requests((reader, nobody), (reader, nobody))
+            await gate.of_link()((reader, nobody), (reader, nobody))
 
     asyncio.run(refuse())
     assert 1 < len(caplog.messages) < 50
@@ -881,16 +881,17 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
 
     async def run() -> int:
         gate, taken = EngineGate(engine.path), 0
+        passes = gate.of_link()
         readers = [asyncio.StreamReader() for _ in range(100)]
         nobody = AsyncMock(asyncio.StreamWriter, write=Mock())
         head = b"POST /containers/create HTTP/1.1\r\nContent-Length: 1000000\r\n\r\n"
         for reader in readers:
             reader.feed_data(head + b" " * 60_000)
-        ways = [asyncio.create_task(gate.pass_requests((reader, nobody), (reader, nobody))) for reader in readers]
+        ways = [asyncio.create_task(passes((reader, nobody), (reader, nobody))) for reader in readers]
         small = asyncio.StreamReader()
         small.feed_data(request("GET /info"))
         small.feed_eof()
-        await gate.pass_requests((small, nobody), (small, nobody))
+        await passes((small, nobody), (small, nobody))
         written = b"".join(call.args[0] for call in nobody.write.call_args_list)
         assert written.startswith(b"GET /info")
         for reader in readers:
@@ -929,7 +930,7 @@ class Site:
         reader, back = asyncio.StreamReader(), AsyncMock(asyncio.StreamWriter, write=Mock())
         reader.feed_data(request(line))
         reader.feed_eof()
-        await self.gate.pass_requests((reader, back), (reader, back))
+        await self.gate.of_link()((reader, back), (reader, back))
         return b"".join(call.args[0] for call in back.write.call_args_list)
 
     async def start(self, container: str) -> None:

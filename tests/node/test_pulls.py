@@ -27,9 +27,6 @@ class Engine(Asking):
         self.has = set(has)
         self.registry: dict[str, Any] = {}
 
-    async def have(self, path: str, method: str, patience: float, body: Any = None, **_: Any) -> Answer:
-        return await self.ask(path)
-
     async def ask(self, path: str, **_: Any) -> Answer:
         kind, name = path.removeprefix("/v1.41").removesuffix("/json").strip("/").split("/", 1)
         if kind == "images":

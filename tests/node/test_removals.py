@@ -93,7 +93,7 @@ def gate_at(path: str) -> Iterator[None]:
             ways.add(asyncio.current_task())  # type: ignore[arg-type]
             there = await asyncio.open_unix_connection(ENGINE)
             try:
-                await splice((reader, writer), there, there=gate.pass_requests)
+                await splice((reader, writer), there, there=gate.of_link())
             finally:
                 there[1].transport.abort()
                 writer.transport.abort()

@@ -16,7 +16,6 @@ import io
 import json
 import posixpath
 import re
-import secrets
 import tarfile
 from collections.abc import Iterable, Mapping
 from http import HTTPStatus
@@ -24,8 +23,7 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from .engine_rules import DATA, FOLDER, LOOK, NOBODY, OWNER
-from .machine import ask
+from .engine_rules import DATA, FOLDER
 
 _FILES = ("/etc/hosts", "/etc/hostname", "/etc/resolv.conf")
 """That an engine mounts in each container."""
@@ -42,7 +40,6 @@ _USERS = {"/etc/passwd", "/etc/group"}
 of a file it keeps each line that fits."""
 _MOST_USERS = 1 << 20
 """Bytes in one of these."""
-_KNOWN = 4096
 _BLOCK = 512
 _FOLDERS = {FOLDER: re.compile("instance"), DATA: re.compile("[A-Za-z0-9_-][A-Za-z0-9_.-]{0,80}")}
 """Folders that are put in each."""
@@ -148,74 +145,8 @@ def is_odd(stat: Mapping[str, Any]) -> bool:
     return bool(stat["mode"] & -_NO_FILE)
 
 
-class Images:
-    """Knows of images what is at paths in there. Asks one thing at a time, and waits for it."""
-
-    def __init__(self, engine: str) -> None:
-        """``engine``: path of its socket."""
-        self._engine = engine
-        self._known: dict[tuple[str, str], bool] = {}
-
-    def knows(self, image: str, paths: Iterable[str]) -> bool:
-        """Whether `odd` has nothing to ask."""
-        return all((image, path) in self._known for path in paths)
-
-    def odd(self, image: str, paths: Iterable[str]) -> str | None:
-        """One of these paths that is a link in an image, or no file where there must be one; None: none is.
-
-        A container is made of it, and never started: nothing moves there.
-
-        Raises:
-            OSError: The engine does not answer.
-            ValueError: It does not say.
-        """
-        wanted = sorted(paths)
-        if new := [path for path in wanted if (image, path) not in self._known]:
-            found = self._inspect(image, new)
-            self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
-            return next((path for path in new if found[image, path]), None) or self.odd(image, set(wanted) - set(new))
-        return next((path for path in wanted if self._known[image, path]), None)
-
-    def _inspect(self, image: str, paths: list[str]) -> dict[tuple[str, str], bool]:
-        body = {
-            "Image": image,
-            "Entrypoint": ["/never-started"],
-            "Labels": {OWNER: NOBODY},  # or the image could say that it is an orchestrator's, which could start it
-            "HostConfig": {
-                "NetworkMode": "none",
-                "ReadonlyRootfs": True,
-                "CapDrop": ["ALL"],
-                "SecurityOpt": ["no-new-privileges"],
-            },
-        }
-        name = f"{LOOK}{secrets.token_hex(4)}"  # of its own: one that an engine is long about holds up no other
-        made = ask(self._engine, f"/containers/create?name={name}", method="POST", body=body)
-        if made.status != HTTPStatus.CREATED:
-            raise ValueError(f"its image cannot be looked at: {made.content[:200].decode(errors='replace')}")
-        container = json.loads(made.content)["Id"]
-        try:
-            found = {(image, path): self._is_odd(container, path) for path in paths}
-        except BaseException:
-            self._remove(container)
-            raise
-        if not self._remove(container):
-            raise ValueError("what was made of its image was removed meanwhile")  # and nothing was found there
-        return found
-
-    def _remove(self, container: str) -> bool:
-        return (
-            ask(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE").status < HTTPStatus.BAD_REQUEST
-        )
-
-    def _is_odd(self, container: str, path: str) -> bool:
-        answer = ask(self._engine, f"/containers/{container}/archive?{urlencode({'path': path})}", method="HEAD")
-        if answer.status == HTTPStatus.NOT_FOUND:
-            return False
-        if answer.status != HTTPStatus.OK:
-            raise ValueError(f"its engine says {answer.status} to {path}")
-        stat = pull_stat(answer.headers)
-        if stat is None:
-            raise ValueError(f"its engine says nothing of {path}")
-        if path in _USERS:
-            return is_odd(stat) or stat["size"] > _MOST_USERS
-        return bool(stat["mode"] & _LINK)
+def misleads(path: str, stat: Mapping[str, Any]) -> bool:
+    """Whether what an image has at a path is a link, or no file where there must be one, or a large one."""
+    if path in _USERS:
+        return is_odd(stat) or stat["size"] > _MOST_USERS
+    return bool(stat["mode"] & _LINK)

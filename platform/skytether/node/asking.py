@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 from http import HTTPStatus
 from typing import Any
 
-from .machine import Answer, ask, ask_long, lean
+from .machine import Answer, ask_soon, lean
 
 JSON, TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 
@@ -30,25 +29,9 @@ class Asking:
         self._engine = engine
 
     async def ask(self, path: str, **how: Any) -> Answer:
-        """As `ask`; raises `RefusedCall`."""
+        """As `ask_soon`; raises `RefusedCall`."""
         try:
-            return await asyncio.to_thread(ask, self._engine, path, **how)
-        except (OSError, ValueError) as error:
-            raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
-
-    async def have(self, path: str, method: str, patience: float, body: Any = None, **how: Any) -> Answer:
-        """Have it do what may take long, and takes no thread; raises `RefusedCall`.
-
-        Args:
-            path: With the query.
-            method: As HTTP names it.
-            patience: For all of it [s].
-            body: Sent as JSON, unless it is None.
-            how: As of `ask_long`.
-        """
-        try:
-            async with asyncio.timeout(patience):
-                return await ask_long(self._engine, path, method=method, body=body, **how)
+            return await ask_soon(self._engine, path, **how)
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
 

@@ -12,7 +12,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable, Coroutine
 from functools import partial
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -41,7 +41,7 @@ from .engine_rules import (
     published,
 )
 from .files import Files
-from .machine import ANYWHERE, Answer, free_port, is_taken, listed
+from .machine import ANYWHERE, Answer, ask_long, free_port, is_taken, listed
 from .pulls import AUTH, Pulls
 from .registries import Registries
 from .removals import BusyError, Removals, begun
@@ -59,8 +59,8 @@ _MOST_JSON, _MOST_ARCHIVE = 1 << 18, 2 << 20
 times as much."""
 _MOST_DIGITS = 12
 """Of a length."""
-_LARGE, _MOST_LARGE, _BODY_S = 1 << 15, 16, 20.0
-"""Bytes from which on a body is a large one; so many are held at a time, of all orchestrators; and for how long one may
+_LARGE, _MOST_LARGE, _BODY_S = 1 << 15, 2, 20.0
+"""Bytes from which on a body is a large one; so many are held at a time, of each orchestrator; and for how long one may
 take to arrive."""
 _MARKS = {
     "containers": {OWNER},
@@ -75,6 +75,8 @@ _KNOWN = 4096
 """Containers that are remembered to be ours."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
+_MOST_CREATES = 256
+"""Containers that are made at a time."""
 _MADE_S, _MOST_NETWORKS = 60.0, 12
 """For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
 take them all has addresses that the machine knows elsewhere."""
@@ -85,6 +87,8 @@ _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0
 """What an engine may take to say how large all is that it has [s]."""
+_MUCH, _TAKEN_S = 1 << 16, 10.0
+"""Bytes of that, and for how long whoever asked for more of them holds up others [s]."""
 _WEIGHED, _OWNED, _SIZE = ("Volumes.item", "VolumeUsage.Items.item"), f"Labels.{OWNER}", "UsageData.Size"
 
 
@@ -112,20 +116,24 @@ class EngineGate:
         self._removals = Removals(engine)
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
-        self._large = asyncio.Semaphore(_MOST_LARGE)
         self._weighing, self._making = asyncio.Lock(), asyncio.Lock()
+        self._creates = asyncio.Semaphore(_MOST_CREATES)
         asking = Asking(engine)
-        self._ask, self._asked, self._have = asking.ask, asking.asked, asking.have
+        self._ask, self._asked = asking.ask, asking.asked
         self._files = Files(engine, asking)
         names, keep = (store.names(), store.save_names) if store else ({}, lambda _: None)
         self._pulls = Pulls(asking, Registries(registries), names, keep)
 
-    async def pass_requests(self, asks: Stream, engine: Stream) -> None:
-        """Until the one who asks has ended, or was refused something."""
+    def of_link(self) -> Callable[[Stream, Stream], Coroutine[Any, Any, None]]:
+        """What passes requests on that come by one link: large bodies of one wait for no other's."""
+        return partial(self.pass_requests, large=asyncio.Semaphore(_MOST_LARGE))
+
+    async def pass_requests(self, asks: Stream, engine: Stream, large: asyncio.Semaphore) -> None:
+        """Until the one who asks has ended, or was refused something; ``large``: see `of_link`."""
         (reader, back), (_, writer) = asks, engine
         try:
             while True:
-                await self._pass_one(reader, back, writer)
+                await self._pass_one(reader, back, writer, large)
         except asyncio.IncompleteReadError:
             return  # it has ended
         except (RefusedCall, asyncio.LimitOverrunError) as error:
@@ -147,7 +155,11 @@ class EngineGate:
             log.warning("an orchestrator's call to the engine: %s%s", text, more)
 
     async def _pass_one(
-        self, reader: asyncio.StreamReader, back: asyncio.StreamWriter, writer: asyncio.StreamWriter
+        self,
+        reader: asyncio.StreamReader,
+        back: asyncio.StreamWriter,
+        writer: asyncio.StreamWriter,
+        large: asyncio.Semaphore,
     ) -> None:
         head = await reader.readuntil(b"\r\n\r\n")
         first, *rows = head[:-4].split(b"\r\n")
@@ -162,7 +174,7 @@ class EngineGate:
         most = _MOST_ARCHIVE if archive else _MOST_JSON if plain(path) == _MAKES[0] else _LARGE
         if len(query) != len(pairs) or not length.isdigit() or len(length) > _MOST_DIGITS or int(length) > most:
             raise RefusedCall("its query or its length is odd")
-        async with self._large if int(length) > _LARGE else contextlib.nullcontext():
+        async with large if int(length) > _LARGE else contextlib.nullcontext():
             # All of it, an archive too: an engine that waits for the rest of one lets nobody end that container.
             async with asyncio.timeout(_BODY_S):
                 body = await reader.readexactly(int(length))
@@ -181,6 +193,9 @@ class EngineGate:
                 query["tag"] = await self._pulls.digest_of(query["fromImage"], query["tag"], headers)
             path = await self._pulls.path_of(path)
             target = path + (f"?{urlencode(query)}" if query else "")
+            if plain(call.path) == WEIGHED:
+                await self._weigh(target, back)
+                return
             if answered := self._answered(call, path, target, body if archive else b""):
                 await _answer(back, *await answered)
                 return
@@ -203,8 +218,6 @@ class EngineGate:
         """
         path = plain(call.path)
         _, kind, name = (*path.split("/"), "", "")[:3]
-        if path == WEIGHED:
-            return self._weigh(target)
         if path == MADE:
             return asyncio.shield(begun(self._make(target, call.body)))
         if path == _MAKES[0]:
@@ -226,9 +239,9 @@ class EngineGate:
             if "v" in call.query:
                 removes = partial(self._removals.remove_container, name, target, f"{way}?{rest}")
                 return self._kept(self._removals.end(name, removes))
-            return self._kept(self._removals.end(name, partial(self._have, target, "DELETE", _END_S)))
+            return self._kept(self._removals.end(name, partial(self._ask, target, method="DELETE", patience=_END_S)))
         if kind == "containers" and path.endswith(("/kill", "/update")):
-            asks = partial(self._have, target, "POST", _END_S, call.body)
+            asks = partial(self._ask, target, method="POST", patience=_END_S, body=call.body)
             return self._kept(self._removals.end(name, asks))
         return None
 
@@ -313,12 +326,15 @@ class EngineGate:
         found = ((said.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT)
         for bound in found if isinstance(found, list) else ():
             bound["HostPort"] = bound.get("HostPort") or str(free_port(bound.get("HostIp") or ""))
-        answer = await self._have(target, "POST", _MADE_S, said)
+        if self._creates.locked():
+            raise RefusedCall("too many containers are being made", HTTPStatus.SERVICE_UNAVAILABLE)
+        async with self._creates:  # however long it takes
+            answer = await self._tried(ask_long(self._engine, target, method="POST", body=said))
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
             described = await self._ask(f"/containers/{made}/json", most=_MOST_DESCRIBED + 1)
             if len(described.content) > _MOST_DESCRIBED:
-                await self._have(f"/containers/{made}?force=1&v=1", "DELETE", _END_S)
+                await self._ask(f"/containers/{made}?force=1&v=1", method="DELETE", patience=_END_S)
                 raise RefusedCall(
                     f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says"
                 )
@@ -330,7 +346,7 @@ class EngineGate:
             status, found = await self._asked(f"/networks?{urlencode({'filters': json.dumps({'label': [NETWORK]})})}")
             if status != HTTPStatus.OK or len(found) >= _MOST_NETWORKS:
                 raise RefusedCall(f"orchestrators made {_MOST_NETWORKS} networks here, as many as they may")
-            answer = await self._have(target, "POST", _MADE_S, said)
+            answer = await self._ask(target, method="POST", patience=_MADE_S, body=said)
         return answer.status, answer.content, JSON
 
     async def _network(self, target: str) -> tuple[int, bytes, str]:
@@ -340,18 +356,25 @@ class EngineGate:
             found = {key: value for key, value in found.items() if key not in ("Containers", "Peers", "Services")}
         return status, json.dumps(found).encode(), JSON
 
-    async def _weigh(self, target: str) -> tuple[int, bytes, str]:
-        """Of what there is what is ours."""
+    async def _weigh(self, target: str, back: asyncio.StreamWriter) -> None:
+        """Tell of what there is what is ours: one at a time, if it is much until who asked has taken it."""
         async with self._weighing:
             there = await self._tried(
                 asyncio.to_thread(listed, self._engine, target, _WEIGHED, ("Name", _OWNED, _SIZE), patience=_WEIGH_S)
             )
-        ours = [
-            {"Name": one["Name"], "Labels": {OWNER: one[_OWNED]}, "UsageData": {"Size": one[_SIZE]}}
-            for one in there
-            if one.keys() >= {"Name", _OWNED, _SIZE}
-        ]
-        return HTTPStatus.OK, json.dumps({"Volumes": ours}).encode(), JSON
+            ours = [
+                {"Name": one["Name"], "Labels": {OWNER: one[_OWNED]}, "UsageData": {"Size": one[_SIZE]}}
+                for one in there
+                if one.keys() >= {"Name", _OWNED, _SIZE}
+            ]
+            del there
+            told = json.dumps({"Volumes": ours}).encode()
+            del ours
+            if len(told) > _MUCH:
+                async with asyncio.timeout(_TAKEN_S):
+                    await _answer(back, HTTPStatus.OK, told, JSON)
+                return
+        await _answer(back, HTTPStatus.OK, told, JSON)
 
     async def _is_ours(self, subject: Subject) -> bool:
         """Whether an orchestrator made it, or there is none: the engine says that itself."""

@@ -80,7 +80,7 @@ _HOST = _LIMITS | {
     *("PidsLimit", "IpcMode", "Tmpfs", "Mounts", "Devices", "GroupAdd", "DeviceRequests", "LogConfig", "CgroupParent"),
 }
 _NETWORK_OPTIONS = {"com.docker.network.bridge.name", "com.docker.network.bridge.enable_icc"}
-_MOST_LABELS, _MOST_LABELLED = 64, 8 << 10
+_MOST_LABELS, _MOST_LABELLED, _MOST_OWNER = 64, 8 << 10, 128
 """Of one thing, and bytes of these: an engine tells of all of them whenever it lists what it has."""
 PORT = "7600/udp"
 """Inside: where a service's end of the bridge is."""
@@ -410,6 +410,8 @@ def _labels(given: Mapping[str, Any]) -> str | None:
     labels = _at(given, "Labels")
     if labels.get(OWNER) == NOBODY:  # which is the node's own word: no orchestrator could remove it any more
         return f"the label {OWNER} of what is nobody's"
+    if len(str(labels.get(OWNER, ""))) > _MOST_OWNER:  # it is told again and again
+        return f"a label {OWNER} of more than {_MOST_OWNER} characters"
     if len(labels) > _MOST_LABELS:
         return f"more than {_MOST_LABELS} labels"
     much = sum(len(key) + len(str(value)) for key, value in labels.items()) > _MOST_LABELLED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import io
 import os
 import stat
@@ -17,9 +16,10 @@ from typing import Any, TypeVar
 
 from skytether.api.service_report import MOST_BYTES
 
-from .archives import STAT, Images, is_odd, moved, pull_stat, push_stat, ways
+from .archives import STAT, is_odd, moved, pull_stat, push_stat, ways
 from .asking import JSON, TAR, Asking, RefusedCall
 from .engine_rules import FOLDER
+from .images import Images
 
 _T = TypeVar("_T")
 _KNOWN = 4096
@@ -40,7 +40,6 @@ class Files:
         self._images = Images(engine)
         self._opened: set[str] = set()
         """Containers into whose files the engine may look."""
-        self._looking = asyncio.Lock()
 
     async def may_be_opened(self, container: str) -> None:
         """Raises `RefusedCall` unless the engine may look into its files, or it is gone."""
@@ -51,10 +50,9 @@ class Files:
             return
         if status != HTTPStatus.OK or (refused := moved(found)):
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
-        image, paths = str(found["Image"]), ways(found)
+        mounts = [str(one["Destination"]) for one in found.get("Mounts") or ()]
         try:
-            async with contextlib.nullcontext() if self._images.knows(image, paths) else self._looking:
-                odd = await asyncio.to_thread(self._images.odd, image, paths)
+            odd = await self._images.odd(str(found["Image"]), ways(found), mounts)
         except (OSError, ValueError) as error:
             raise RefusedCall(f"its image is not looked at: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
         if odd:

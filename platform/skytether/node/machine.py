@@ -30,8 +30,10 @@ from .calls import address_of
 
 _ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
 _ENGINE_S = 10.0
-_MOST = 1 << 20
-"""Bytes of an engine's answer."""
+_MOST, _MOST_HEAD, _PIECE = 1 << 20, 1 << 16, 1 << 16
+"""Bytes of an engine's answer, of the head before it, and of what is read at a time."""
+_MOST_TEXT = 1024
+"""Characters of what is asked for of a thing in a list; longer ones are left out."""
 _HEAVY = {"Args", "Cmd", "Entrypoint", "Env", "ExposedPorts", "OnBuild", "Shell", "Volumes"}
 _OURS, _MOST_OF_ONE = "skytether", 4096
 ANYWHERE = "0.0.0.0"  # noqa: S104 (nobody listens)
@@ -190,10 +192,23 @@ def listed(
                     if len(found) > _MOST_LISTED or time.monotonic() > until:
                         raise TooMuchError("it has too much to tell")
                 elif found and event in _PLAIN and where.startswith(start) and (key := where[len(start) :]) in keys:
-                    found[-1][key] = value
+                    if not isinstance(value, str) or len(value) <= _MOST_TEXT:
+                        found[-1][key] = value
         except ijson.JSONError as error:
             raise ValueError(f"its answer is no JSON: {error}") from error
     return found
+
+
+async def ask_soon(path: str, what: str, *, method: str = "GET", patience: float = _ENGINE_S, **how: Any) -> Answer:
+    """The same, by `ask_long`; ``patience``: for all of it [s].
+
+    While an engine starts a container it says nothing of it: of threads that wait for that there would soon be none.
+    """
+    try:
+        async with asyncio.timeout(patience):
+            return await ask_long(path, what, method=method, **how)
+    except TimeoutError:
+        raise TimeoutError(f"it says nothing for {patience:g} s") from None
 
 
 async def ask_long(
@@ -204,10 +219,9 @@ async def ask_long(
     archive: bytes = b"",
     body: Any = None,
     headers: Mapping[str, str] | None = None,
+    most: int = _MOST,
 ) -> Answer:
-    """One call that an engine may take any time for; of its answer there is the status, and what is in it.
-
-    It takes no thread meanwhile: these are few.
+    """One call that an engine may take any time for. It takes no thread meanwhile.
 
     Args:
         path: Of the engine's socket.
@@ -216,6 +230,7 @@ async def ask_long(
         archive: Sent, unless it is empty.
         body: Sent as JSON in its place, unless it is None.
         headers: More of them.
+        most: Bytes of the answer, which is cut off there.
 
     Raises:
         OSError: It does not answer.
@@ -230,15 +245,17 @@ async def ask_long(
         rows = "".join(f"{key}: {value}\r\n" for key, value in given.items())
         asked = f"{method} {what} HTTP/1.0\r\n{rows}Content-Length: {len(content)}\r\n\r\n"
         writer.write(asked.encode() + content)
-        said = b""
-        while len(said) < _MOST and (piece := await reader.read(_MOST - len(said))):
+        said, start = bytearray(), 0
+        while len(said) < (start + most if start else _MOST_HEAD) and (piece := await reader.read(_PIECE)):
             said += piece
+            start = start or said.find(b"\r\n\r\n") + 4 * (b"\r\n\r\n" in said)
     finally:
         writer.transport.abort()
-    head, _, content = said.partition(b"\r\n\r\n")
-    if not (found := _STATUS.match(head)):
+    if not (found := _STATUS.match(said)) or start < len(b"\r\n\r\n"):
         raise ValueError("it ended before it said whether it did it")
-    return Answer(int(found[1]), {}, content)
+    rows = (row.partition(":") for row in said[:start].decode("latin-1").split("\r\n")[1:])
+    heads = {name.lower(): value.strip() for name, _, value in rows if name}
+    return Answer(int(found[1]), heads, bytes(said[start : start + most]))
 
 
 def lean(content: bytes) -> Any:

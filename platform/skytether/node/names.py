@@ -18,6 +18,11 @@ class Names:
         self._threads = ThreadPoolExecutor(most, thread_name_prefix="names")
         self._asked: dict[str, Future[list[str]]] = {}
 
+    @property
+    def asked(self) -> set[str]:
+        """Those that are being resolved, or wait for that."""
+        return {name for name, one in self._asked.items() if not one.done()}
+
     async def find(self, host: str) -> list[str]:
         """Addresses of a name; of one it is asked once at a time, whoever waits no more.
 

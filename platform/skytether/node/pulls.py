@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 
 from .asking import Asking, RefusedCall
 from .engine_rules import DIGEST
-from .registries import Registries
+from .registries import DOCKER_HUB, Registries, registry_of
 
 _IMAGE = re.compile(r"((?:/v[0-9.]+)?/images/)([^@]+)/json")
 _MOST, _OLDER = 1 << 12, 2
-"""Names that are kept, and for each so many digests, the newest first: a pull may fail."""
+"""Names that are kept, those that were used last at the end; for each so many digests, the newest first: a pull may
+fail."""
 _REGISTRY_S = 60.0
 """For a registry to say what is there [s]."""
 AUTH = b"x-registry-auth"
@@ -63,7 +65,7 @@ class Pulls:
         if (await self._asking.ask(f"/images/{name}/json", most=1)).status != HTTPStatus.NOT_FOUND:
             raise RefusedCall(f"the image {name[:80]} is this machine's own: nothing else is pulled by that name")
         auth = {"X-Registry-Auth": headers[AUTH].decode()} if AUTH in headers else {}
-        answer = await self._asking.have(f"/distribution/{name}/json", "GET", _REGISTRY_S, headers=auth)
+        answer = await self._asking.ask(f"/distribution/{name}/json", patience=_REGISTRY_S, headers=auth)
         try:
             said = json.loads(answer.content)
             if answer.status != HTTPStatus.OK:
@@ -79,8 +81,9 @@ class Pulls:
     def _note(self, name: str, digest: str) -> None:
         before = self._names.pop(name, [])
         self._names[name] = [digest, *(one for one in before if one != digest)][:_OLDER]
-        while len(self._names) > _MOST:
-            del self._names[next(iter(self._names))]
+        while len(self._names) > _MOST:  # of the registry that has most the one that was used before all others
+            most, _ = Counter(map(registry_of, self._names)).most_common(1)[0]
+            del self._names[next(one for one in self._names if registry_of(one) == most)]
         try:
             self._keep(self._names)
         except OSError as error:
@@ -92,8 +95,12 @@ class Pulls:
         if found is None:
             return path
         repository, tag = _split(found[2])
-        digests = self._names.get(_familiar(f"{repository}:{tag or 'latest'}"), ())
-        if not digests or (await self._status(path)) != HTTPStatus.NOT_FOUND:
+        name = _familiar(f"{repository}:{tag or 'latest'}")
+        digests = self._names.get(name)
+        if not digests:
+            return path
+        self._names[name] = self._names.pop(name)
+        if (await self._status(path)) != HTTPStatus.NOT_FOUND:
             return path
         for digest in digests:
             pinned = f"{found[1]}{repository}@{digest}/json"
@@ -113,4 +120,5 @@ def _split(name: str) -> tuple[str, str]:
 
 def _familiar(image: str) -> str:
     """A name as an engine shortens it."""
-    return re.sub(r"^(?:(?:index\.)?docker\.io/)?(?:library/)?", "", image)
+    short = re.sub(r"^(?:index\.)?docker\.io/", "", image)
+    return short.removeprefix("library/") if registry_of(short) == DOCKER_HUB else image

@@ -7,14 +7,18 @@ told. So an orchestrator could read what programs say that listen on loopback.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
-import socket
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 
 from .machine import own_addresses
+from .names import Names
 
 DOCKER_HUB = "docker.io"
+_MOST, _MOST_OF_DOMAIN = 32, 2
+"""Names that are resolved at a time, and of one domain: those that take for ever wait for each other, and for few
+else."""
+_MOST_KNOWN = 256
 
 
 def registry_of(image: str) -> str:
@@ -37,8 +41,9 @@ class Registries:
     def __init__(self, named: Iterable[str] = (), resolve_s: float = 5.0) -> None:
         self._named = frozenset(named)
         self._resolve_s = resolve_s
-        # One thread: names that take for ever to resolve wait for each other, and for nobody else.
-        self._resolver = ThreadPoolExecutor(1, thread_name_prefix="registry")
+        self._names = Names(_MOST)
+        self._elsewhere: dict[str, None] = {}
+        """Hosts that were found last not to be this machine, those of late at the end."""
 
     async def refusal(self, image: str) -> str | None:
         """Why an image is not pulled, in a sentence; None: it may be."""
@@ -47,19 +52,33 @@ class Registries:
             return None if registry in self._named else f"nobody named the registry {registry[:80]} as it joined"
         host = registry.partition(":")[0]
         try:
-            async with asyncio.timeout(self._resolve_s):
-                found = await asyncio.get_running_loop().run_in_executor(self._resolver, _addresses, host)
+            found = await self._find(host)
         except TimeoutError:
-            return f"the registry {registry[:80]} cannot be found in time"
+            # A name server that does not answer for names of somebody's is asked for no known one's either.
+            return None if host in self._elsewhere else f"the registry {registry[:80]} cannot be found in time"
         except (OSError, UnicodeError):
             return None  # nor does the engine find it
+        self._elsewhere.pop(host, None)
         if any(_is_here(address) for address in found):
             return f"the registry {registry[:80]} is this machine: name it as it joins, by --registry"
+        self._elsewhere[host] = None
+        while len(self._elsewhere) > _MOST_KNOWN:
+            del self._elsewhere[next(iter(self._elsewhere))]
         return None
 
+    async def _find(self, host: str) -> list[str]:
+        with contextlib.suppress(ValueError):
+            return [str(ipaddress.ip_address(host))]
+        domain = _domain(host)
+        if sum(_domain(name) == domain for name in self._names.asked - {host}) >= _MOST_OF_DOMAIN:
+            raise TimeoutError
+        async with asyncio.timeout(self._resolve_s):
+            return [address.partition("%")[0] for address in await self._names.find(host)]
 
-def _addresses(host: str) -> set[str]:
-    return {str(row[4][0]).partition("%")[0] for row in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)}
+
+def _domain(host: str) -> str:
+    """What somebody has all names below."""
+    return ".".join(host.lower().rstrip(".").split(".")[-2:])
 
 
 def _is_here(address: str) -> bool:

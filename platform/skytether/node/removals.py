@@ -22,7 +22,7 @@ from urllib.parse import urlencode
 
 from .engine_rules import LOOKS, NOBODY, OWNER
 from .kin import Kin
-from .machine import Answer, TooMuchError, ask, ask_long, lean, listed, picked
+from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +43,7 @@ _MOST_MINE = 1 << 15
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
+_ENDS = "the container whose network it joins is being ended"
 _VOLUME = "volume "
 """What volumes are known by, before their names: they may be named as containers are."""
 
@@ -103,7 +104,7 @@ class Removals:
             raise BusyError("something is being put into it")
         (joined,) = joins or ("",)
         if joined in self._ending:
-            raise BusyError("the container whose network it joins is being ended")
+            raise BusyError(_ENDS)
         self._kin.meet(things)
         self._mine.add(container)
         if len(self._mine) > _MOST_MINE:
@@ -126,6 +127,8 @@ class Removals:
             return await ask_long(self._engine, path, method="POST")
         try:
             async with self._pauses.setdefault(joined, asyncio.Lock()):
+                if joined in self._ending:
+                    raise BusyError(_ENDS)
                 try:
                     held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if held.status >= HTTPStatus.BAD_REQUEST:
@@ -151,12 +154,20 @@ class Removals:
         log.error("container %s stays paused: docker unpause %s", container, container)
 
     async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
-        """Have something done by which a container may end, which it must not while another one joins its network."""
+        """Have something done by which a container may end, which it must not while another one joins its network.
+
+        Who joins it just now is waited for; who wants to, does not any more.
+        """
         await self.look_back()
-        if container in self._joined:
-            raise BusyError("another container is just joining its network")
         self._ending[container] += 1
         try:
+            if (joining := self._pauses.get(container)) is not None:
+                try:
+                    async with asyncio.timeout(_WAIT_S):
+                        await joining.acquire()
+                except TimeoutError:
+                    raise BusyError("another container is just joining its network") from None
+                joining.release()
             return await work()
         finally:
             self._ending[container] -= 1
@@ -176,7 +187,7 @@ class Removals:
             own: Where a volume must be that it alone has, for files are written there; empty: there is no file.
         """
         await self.look_back()
-        answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
+        answer = await ask_soon(self._engine, f"/containers/{container}/json")
         takes = answer.status == HTTPStatus.OK and _takes_files(answer.content, own)
         del answer  # it may be large, and the engine may take any time
         if container in self._mine or not takes:
@@ -195,7 +206,7 @@ class Removals:
             without: Those by which they stay.
         """
         await self.look_back()
-        answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json")
+        answer = await ask_soon(self._engine, f"/containers/{container}/json")
         if answer.status != HTTPStatus.OK:
             return answer  # it is gone, or nobody knows its volumes
         things = (container, *_volumes(lean(answer.content)))
@@ -291,6 +302,8 @@ class Removals:
                         continue
                     joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
                     self._joined[paused] += 1
+                    self._pauses[paused] = asyncio.Lock()
+                    await self._pauses[paused].acquire()
                     begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
@@ -309,12 +322,12 @@ class Removals:
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
         """An earlier program may have ended while it had it paused, for others that joined its network."""
         try:
-            async with self._pauses.setdefault(container, asyncio.Lock()):
-                for one in joining:
-                    while not await self._is_settled(one):
-                        await asyncio.sleep(_SETTLED_S)
-                await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+            for one in joining:
+                while not await self._is_settled(one):
+                    await asyncio.sleep(_SETTLED_S)
+            await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
         finally:
+            self._pauses[container].release()
             self._has_joined(container)
 
     async def _running(self, things: Iterable[str]) -> set[str]:
@@ -335,7 +348,7 @@ class Removals:
         It says nothing of one that it starts just now, as an earlier program may have asked it to.
         """
         try:
-            answer = await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+            answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
             if answer.status == HTTPStatus.NOT_FOUND:
                 return False
             return picked(answer.content, "State", "Running")["State"]["Running"] is not False
@@ -345,7 +358,7 @@ class Removals:
     async def _is_settled(self, container: str) -> bool:
         """Whether an engine says anything of it: not while it starts it."""
         try:
-            await asyncio.to_thread(ask, self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+            await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
         except (OSError, ValueError):
             return False
         return True

@@ -219,7 +219,8 @@ class NodeProgram:
             self._linked.add(url)
             self._learn(linked.urls)
             there = str(writer.get_extra_info("peername")[0])
-            ways = partial(self._way, url, there, writer, linked.link)
+            passes = self._gate.of_link() if self._gate else None
+            ways = partial(self._way, url, there, writer, linked.link, passes)
             await self._both(self._receive(reader, writer, ways), self._monitor(url, writer, linked))
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, ValidationError) as error:
             raise NodeError(f"the link to {url} ended: {str(error) or type(error).__name__}") from error
@@ -332,7 +333,14 @@ class NodeProgram:
 
     # Ways
 
-    async def _way(self, url: str, there: str, told: asyncio.StreamWriter, link: str) -> None:
+    async def _way(
+        self,
+        url: str,
+        there: str,
+        told: asyncio.StreamWriter,
+        link: str,
+        passes: Callable[[Stream, Stream], Coroutine[Any, Any, None]] | None,
+    ) -> None:
         """One connection for somebody who asks the engine from there."""
         try:
             reader, writer = await self._open(url, (there,), Way(link=link))
@@ -349,7 +357,7 @@ class NodeProgram:
                     doubt.set()
                 raise
             try:
-                await splice((reader, writer), engine, there=self._gate.pass_requests if self._gate else None)
+                await splice((reader, writer), engine, there=passes)
             finally:
                 engine[1].transport.abort()
         except (OSError, asyncio.IncompleteReadError):

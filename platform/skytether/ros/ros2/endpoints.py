@@ -110,9 +110,11 @@ class Publication(Handle):
         self._using = threading.RLock()
         """A publisher of Zenoh's must not be undeclared while another thread puts something."""
 
-    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
+    def put(
+        self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None, *, first: bool = False
+    ) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped."""
-        del until, renewed  # nothing waits here
+        del until, renewed, first  # nothing waits here
         if self.endpoint.qos.transient_local:
             self._kept = payload
         sent = self._publisher is not None and not self.refused

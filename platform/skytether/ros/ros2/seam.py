@@ -76,13 +76,17 @@ class Publication(Handle, Protocol):
         """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
         ...
 
-    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
+    def put(
+        self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None, *, first: bool = False
+    ) -> bool:
         """Publish one serialised message; from any thread, returns at once. False if it was dropped.
 
         Args:
             payload: The message.
             until: After that it is not published any more, where it has ``fresh_s`` [s].
-            renewed: Nor once more have come than that; None: those that are known now, if somebody hears.
+            renewed: Nor once more have come than that, or may have, for a moment; None: those that are known now, if
+                somebody hears.
+            first: It is good as a first word, and goes to whoever listens.
         """
         ...
 

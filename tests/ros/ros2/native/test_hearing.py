@@ -2,13 +2,13 @@
 
 import pytest
 
-from skytether.ros.ros2.native.side.hearing import HEARS_S, SILENT_S, Hearing
+from skytether.ros.ros2.native.side.hearing import DOUBT_S, HEARS_S, SILENT_S, Hearing
 
 TICK = 0.02
 
 
 class Publisher:
-    """One message each tick, to so many who listen, some of whom acknowledge nothing."""
+    """One message each tick, to so many who listen."""
 
     def __init__(self):
         self.hearing = Hearing()
@@ -18,7 +18,7 @@ class Publisher:
         self.keys = []
 
     def publish(self, listeners, read, ticks=1, swapped=False, shown=True):
-        """``listeners``: letters, each the name of a node; a space has none yet, a capital acknowledges nothing."""
+        """``listeners``: letters, each the name of a node; a space has none yet."""
         if len(listeners) < len(self.keys):
             gone = next(i for i, name in enumerate(self.before) if listeners[i : i + 1] != name)
             del self.keys[gone : gone + len(self.keys) - len(listeners)]
@@ -27,7 +27,7 @@ class Publisher:
         self.came += new
         self.before = listeners
         self.keys = keys if shown else self.keys
-        nodes = {key: (name.strip(), not name.isupper()) for key, name in zip(self.keys, listeners, strict=True)}
+        nodes = {key: name.strip() for key, name in zip(self.keys, listeners, strict=True)}
         for _ in range(ticks):
             self.now += TICK
             self.hearing.update(len(listeners), self.came, read, self.now, lambda: nodes)
@@ -70,10 +70,44 @@ def test_who_comes_to_watch_stops_nobody(publisher):
     assert publisher.publish("b", True).heard, "and who goes"
 
 
-def test_who_comes_without_a_name_yet_stops_nobody_where_all_who_were_there_acknowledge(publisher):
+def test_while_it_is_not_known_who_came_nothing_is_said_but_a_first_word(publisher):
     publisher.publish("b", True, 5)
-    assert publisher.publish("b ", False).heard, "of who comes nothing is acknowledged yet"
-    assert publisher.publish("be", True).heard
+    renewed = publisher.hearing.renewed
+    assert publisher.publish("b ", True).holds
+    assert publisher.publish("b ", True, 5).holds
+    assert not publisher.publish("be", True).holds, "one who only listens"
+    assert publisher.hearing.renewed == renewed
+    assert publisher.publish("be ", True).holds
+    assert not publisher.publish("bee", True).holds
+    assert publisher.hearing.renewed == renewed + 1, "one who was there, by another process"
+
+
+def test_who_has_no_name_for_long_is_to_hear_a_first_word(publisher):
+    publisher.publish("b", True, 5)
+    renewed = publisher.hearing.renewed
+    assert publisher.publish("b ", True, int(DOUBT_S / TICK)).holds
+    assert not publisher.publish("b ", True, 2).holds
+    assert publisher.hearing.renewed == renewed + 1
+    assert not publisher.publish("be", True).holds
+    assert publisher.hearing.renewed == renewed + 1, "he has heard it"
+
+
+def test_who_has_heard_a_first_word_before_his_name_was_known_needs_no_other(publisher):
+    publisher.publish("b", True, 5)
+    publisher.publish("b ", True)
+    publisher.hearing.tell(2, publisher.now, first=True)
+    assert not publisher.hearing.holds
+    renewed = publisher.hearing.renewed
+    assert publisher.publish("bb", True, 5).renewed == renewed
+
+
+def test_one_whom_the_graph_does_not_show_yet_is_waited_for(publisher):
+    publisher.publish("b", True, 5)
+    hearing = publisher.hearing
+    hearing.update(2, publisher.came + 1, True, publisher.now, lambda: {1: "b"})
+    assert hearing.holds
+    hearing.update(2, publisher.came + 1, True, publisher.now, lambda: {1: "b", 2: "e"})
+    assert not hearing.holds
 
 
 def test_the_wheels_whose_name_was_not_known_as_they_came_are_known_as_they_go(publisher):
@@ -83,20 +117,6 @@ def test_the_wheels_whose_name_was_not_known_as_they_came_are_known_as_they_go(p
     for there in ("rb", "rb ", "rb"):
         publisher.publish(there, True, 5)
     assert not publisher.publish("rbx", True).heard, "nobody knew who that was"
-
-
-@pytest.mark.parametrize(("there", "read"), [("b", False), ("B", True), ("rB", True)])
-def test_who_comes_without_a_name_yet_may_be_one_who_was_killed_and_is_shown_still(publisher, there, read):
-    publisher.publish(there, True, 5)
-    publisher.publish(there, read, 13)
-    assert publisher.hearing.heard
-    assert not publisher.publish(f"{there} ", read).heard
-
-
-def test_who_comes_without_a_name_yet_stops_nobody_where_one_acknowledges_a_little_late(publisher):
-    publisher.publish("b", True, 5)
-    publisher.publish("b", False, 8)
-    assert publisher.publish("b ", False).heard
 
 
 def test_who_comes_while_nobody_is_heard_is_to_hear_a_first_word(publisher):

@@ -14,6 +14,7 @@ from math import inf
 from skytether.control.admittance import Velocity
 from skytether.guard.board import Place
 from skytether.guard.teller import Sent
+from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Bool, Header, MarkerArray, Message, Time, Twist, TwistStamped, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
@@ -74,12 +75,12 @@ class Ros2Wheels(RosWheels[GraphNode]):
 
     def write(self, velocity: Velocity, until: float = inf) -> None:
         """Wheels: publish it."""
-        twist = twist_of(velocity)
+        twist, stands = twist_of(velocity), velocity == STANDSTILL
         if self._way.cmd_vel_type == TwistStamped.TYPE:
             header = Header(Time.from_seconds(self._clock()), self._way.frame)
-            self._publication.put(encode(TwistStamped(header, twist)), until, self._renewed)
+            self._publication.put(encode(TwistStamped(header, twist)), until, self._renewed, first=stands)
         else:
-            self._publication.put(encode(twist), until, self._renewed)
+            self._publication.put(encode(twist), until, self._renewed, first=stands)
 
     def enable(self, level: bool) -> None:
         """Wheels: publish it."""

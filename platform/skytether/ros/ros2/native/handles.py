@@ -20,7 +20,7 @@ from ...velocities import VELOCITIES
 from ..dialect import Endpoint
 from ..qos import Qos, follow, history_missed
 from .overrun import QUIET_S, Overrun
-from .side.frames import FOR_ALL, Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
+from .side.frames import FIRST_WORD, FOR_ALL, Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)
@@ -138,7 +138,9 @@ class Publication(Handle):
         self._kept: bytes | None = None
         """The newest message of a transient-local topic, for when the program runs again."""
 
-    def put(self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None) -> bool:
+    def put(
+        self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None, *, first: bool = False
+    ) -> bool:
         """See `skytether.ros.ros2.seam.Publication.put`."""
         body = bytes(payload)
         if self.endpoint.qos.transient_local:
@@ -149,7 +151,7 @@ class Publication(Handle):
                 self.dropped += 1
             return False
         if self._fresh_s < inf:  # what becomes of each the program tells, or its end
-            sender.put(self._fresh(body, until, renewed))
+            sender.put(self._fresh(body, until, FIRST_WORD if first else renewed))
             return True
         pushed_out = sender.put(Frame(Kind.DATA, self.channel, body))  # an older one of this topic
         self.dropped += pushed_out

@@ -9,7 +9,7 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, int64 for whom, serialised message, which is
   published until then or never, and to nobody who came later: for whom is how often somebody had come who is to hear a
-  first word, or -1, and it is for all; from the node the number, float64 seconds for which nobody has acknowledged what
+  first word, or -1 or -2, and it is for all; from the node the number, float64 seconds for which nobody has acknowledged what
   was published, uint64 how many of this topic were published so far, a bool, whether they are heard, and int64 how
   often somebody came: this message, and those before it, wait no more. A velocity of a subscription comes from the node
   as others go to it, and is taken until then or never.
@@ -24,8 +24,8 @@ from typing import Any, NamedTuple, Protocol
 
 HEAD = struct.Struct("<IBI")
 NUMBER = struct.Struct("<Q")
-FOR_ALL = -1
-"""A message that goes to whoever listens."""
+FOR_ALL, FIRST_WORD = -1, -2
+"""Messages that go to whoever listens; the second is good as the first that somebody hears."""
 FRESH = struct.Struct("<Qdq")
 _DEALT_WITH = struct.Struct("<QdQ?q")
 SHUT_DOWN = 3

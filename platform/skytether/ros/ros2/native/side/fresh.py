@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from . import graph
-from .frames import FOR_ALL, Frame, dealt_with
+from .frames import FIRST_WORD, FOR_ALL, Frame, dealt_with
 from .hearing import Hearing
 
 FAREWELL_S = 0.3
@@ -67,7 +67,7 @@ class FreshPublisher:
         Args:
             number: What the agent calls it.
             until: Not after that [s].
-            renewed: It is no first word for who came after so many; `FOR_ALL`: it may be.
+            renewed: It is no first word for who came after so many, or may have; or `FOR_ALL`, or `FIRST_WORD`.
             body: The message, serialised.
         """
         published = False
@@ -86,14 +86,16 @@ class FreshPublisher:
             came = self._came()
             hearing.update(publisher.get_subscription_count(), came, self._read, now, self._nodes)
         with self._speaking():
-            known = renewed == FOR_ALL or (renewed == hearing.renewed and came == self._came())
+            known = renewed in (FOR_ALL, FIRST_WORD) or (
+                renewed == hearing.renewed and came == self._came() and not hearing.holds
+            )
             new = bool(known and self._now() <= until)
             if new:
                 self._published_at = self._now()
                 publisher.publish(body)
         if new:
             with self._lock:
-                hearing.tell(publisher.get_subscription_count(), self._now())
+                hearing.tell(publisher.get_subscription_count(), self._now(), first=renewed == FIRST_WORD)
         return new
 
     def look(self) -> bool:

@@ -88,15 +88,9 @@ def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
-def listeners(node: Any, topic: str) -> dict[str, tuple[str, bool]]:
-    """Who subscribes a topic: by subscription its node, empty where that is not told, or not yet.
-
-    With each whether it acknowledges messages.
-    """
-    return {
-        _gid(info): (_node(info), info.qos_profile.reliability == ReliabilityPolicy.RELIABLE)
-        for info in node.get_subscriptions_info_by_topic(topic)
-    }
+def listeners(node: Any, topic: str) -> dict[str, str]:
+    """Who subscribes a topic: by subscription its node, empty where that is not told, or not yet."""
+    return {_gid(info): _node(info) for info in node.get_subscriptions_info_by_topic(topic)}
 
 
 def others(node: Any) -> tuple[int, int]:

@@ -6,12 +6,10 @@ from collections.abc import Callable, Collection, Mapping
 
 from .comers import Comers
 
-Listener = tuple[str, bool]
-"""Name of the node, empty where it is not known, and whether it acknowledges what it hears."""
-Nodes = Callable[[], Mapping[str, Listener]]
-"""Gives those who listen, each under what is another's if it is another's subscription."""
-LIVE_S = 0.25
-"""Within which somebody has acknowledged something who was not killed and started again meanwhile."""
+Nodes = Callable[[], Mapping[str, str]]
+"""Gives names of those who listen, empty where it is not known, each under what is its subscription's alone."""
+DOUBT_S = 0.5
+"""For the name of who came to be known; by then he counts as one who is to hear a first word."""
 SILENT_S = 0.5
 """Without an acknowledgement of somebody who listens: who begins to listen then may come in his place."""
 HEARS_S = 3.0
@@ -40,8 +38,16 @@ class Hearing:
         """Since when somebody listens to what was published [s]."""
         self._listeners = 0
         self._came: int | None = 0
-        self._read = False
         self._comers = Comers(awaited)
+        self._hidden = False
+        """Whether somebody came whom the graph does not show yet."""
+        self._doubted_at: float | None = None
+        """Since when it is not known whether somebody who came is to hear a first word [s]."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether somebody came of whom it is not known yet whether he is to hear a first word."""
+        return self._doubted_at is not None
 
     def look(self, listeners: int, came: int | None, now: float, nodes: Nodes) -> bool:
         """See who listens.
@@ -57,19 +63,31 @@ class Hearing:
         """
         before, self._listeners = self._listeners, listeners
         came_before, self._came = self._came, came
-        if listeners == before and came is not None and came == came_before and not self._comers.unnamed:
+        quiet = listeners == before and came is not None and came == came_before
+        if quiet and not self._comers.unnamed and not self._hidden:
             return False
-        back = self._is_anybody_back(nodes(), now)
-        if came is not None and came_before is not None and not self._comers.changed:
-            back |= came - came_before > listeners - before  # one in another's place, whom the graph does not show yet
+        back = self._comers.is_anybody_back(nodes())
+        new = came - came_before if came is not None and came_before is not None else 0
+        if self._comers.changed:
+            self._hidden = False
+        elif new > 0:
+            self._hidden = True
+            back |= new > listeners - before  # one in another's place
+        if not self._comers.doubtful and not self._hidden:
+            self._doubted_at = None
+        elif self._doubted_at is None:
+            self._doubted_at = now
+        back |= self._doubted_at is not None and now - self._doubted_at > DOUBT_S
         if not listeners:
             self.heard, self._told_since = False, None
         elif not before:
             self.renewed += 1
+            self._settle()
         elif back or (listeners > before and self.unread_s > SILENT_S):
             # The wheels' node may have been started again, beside somebody else.
             self.heard, self._told_since = False, now
             self.renewed += 1
+            self._settle()
         else:
             return listeners < before
         return True
@@ -87,19 +105,20 @@ class Hearing:
             nodes: See `look`.
         """
         others = self.look(listeners, came, now, nodes)
-        self._read = read
         if not others and self._told_since is not None and (read or now - self._told_since > HEARS_S):
             self.heard = True
         if read:
             self._read_at = now if listeners else None
         self.unread_s = 0.0 if self._read_at is None else now - self._read_at
 
-    def _is_anybody_back(self, nodes: Mapping[str, Listener], now: float) -> bool:
-        live = self._read or (self._read_at is not None and now - self._read_at <= LIVE_S)  # who was there before
-        all_live = live and all(acknowledges for name, acknowledges in nodes.values() if name)
-        return self._comers.is_anybody_back({key: name for key, (name, _) in nodes.items()}, all_live=all_live)
+    def _settle(self) -> None:
+        """Who is here has heard a first word, or is about to."""
+        self._comers.settle()
+        self._hidden, self._doubted_at = False, None
 
-    def tell(self, listeners: int, now: float) -> None:
-        """A message was published, with so many who listen."""
+    def tell(self, listeners: int, now: float, *, first: bool = False) -> None:
+        """A message was published, with so many who listen; ``first``: it is good as a first word."""
         if listeners and self._told_since is None:
             self._told_since = now
+        if first:
+            self._settle()
