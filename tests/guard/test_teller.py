@@ -141,19 +141,23 @@ def test_what_goes_on_from_something_leaves_while_the_wheels_turn_by_that_or_nev
     assert second.wheels.told[-1].linear > 0
     assert second.wheels.untils[-1] == pytest.approx(1.0 + PATIENCE), "whatever was told after it may not have left"
     assert not second.turn(1.111), "whether they turn or stand nobody knows"
-    assert second.turn(1.2) and second.wheels.told[-1] == STANDSTILL and second.wheels.untils[-1] == pytest.approx(1.2 + FRESH * PERIOD)
+    assert second.turn(1.2)
+    assert second.wheels.told[-1] == STANDSTILL
+    assert second.wheels.untils[-1] == pytest.approx(1.2 + FRESH * PERIOD)
 
 
 def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_left(both):
     first, _ = both
     first.wheels.held = Sent(-inf)
-    assert first.turn(2.0, FAST) and first.wheels.told == [STANDSTILL]
+    assert first.turn(2.0, FAST)
+    assert first.wheels.told == [STANDSTILL]
     for i in range(1, 5):
         assert first.turn(2.0 + i * PERIOD, FAST)
     assert first.wheels.told[-1].linear > 0
     assert first.wheels.untils[-1] == pytest.approx(2.0 + PATIENCE)
     first.wheels.held = Sent(2.08)
-    assert first.turn(2.1, FAST) and first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
+    assert first.turn(2.1, FAST)
+    assert first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
 
 
 def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):

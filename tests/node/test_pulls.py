@@ -135,3 +135,39 @@ def test_of_names_some_are_kept_and_of_a_damaged_file_none(store: NodeStore, mon
     assert list(store.names()) == ["app:2", "app:3", "app:4"]
     (store.folder / "images.json").write_text("{")
     assert store.names() == {}
+
+
+def test_names_of_one_registry_push_out_none_of_another_nor_one_that_is_used(
+    store: NodeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After four thousand pulls from a registry that has any tag, what others had pulled was not found again."""
+    monkeypatch.setattr("skytether.node.pulls._MOST", 8)
+    engine = Engine()
+    engine.registry = {f"evil.example/x:{number}": [FIRST] for number in range(50)}
+    engine.registry |= {"good.example/app:1": [FIRST], "mine:1": [FIRST], "mine:2": [FIRST]}
+
+    async def run() -> None:
+        made = pulls(engine, store)
+        await made.digest_of("good.example/app", "1", {})
+        for number in range(50):
+            await made.digest_of("evil.example/x", str(number), {})
+        assert "good.example/app:1" in store.names()
+        for number in range(50):
+            await made.path_of("/images/evil.example/x:45/json")
+            await made.digest_of("evil.example/x", str(number % 40), {})
+        assert {"good.example/app:1", "evil.example/x:45"} <= store.names().keys()
+
+    asyncio.run(run())
+
+
+def test_a_repository_of_the_hub_is_none_of_a_registry_that_it_is_named_as(store: NodeStore) -> None:
+    engine = Engine()
+    engine.registry = {"docker.io/reg.example/app:1": [FIRST], "reg.example/app:1": [SECOND]}
+
+    async def run() -> None:
+        made = pulls(engine, store)
+        await made.digest_of("reg.example/app", "1", {})
+        await made.digest_of("docker.io/reg.example/app", "1", {})
+
+    asyncio.run(run())
+    assert store.names() == {"reg.example/app:1": [SECOND], "docker.io/reg.example/app:1": [FIRST]}

@@ -84,16 +84,29 @@ def test_what_is_named_is_all(names: dict[str, list[str]]) -> None:
         assert "nobody named the registry" in str(refusal(image, named))
 
 
-def test_a_name_that_takes_for_ever_holds_up_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_take_for_ever_hold_up_few_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a domain whose name server does not answer."""
     hang = threading.Event()
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: hang.wait(60))
+
+    def find(host: str, *_: object, **__: object) -> list[tuple[object, ...]]:
+        if "slow" in host:
+            hang.wait(60)
+        return [(0, 0, 0, "", ("192.0.2.8", 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", find)
 
     async def many() -> None:
-        judge = Registries(resolve_s=0.05)
-        said = await asyncio.gather(*(judge.refusal(f"slow{i}.example/x") for i in range(20)))
-        assert all("cannot be found in time" in str(one) for one in said)
+        judge = Registries(resolve_s=0.2)
+        slow = asyncio.gather(*(judge.refusal(f"a{i}.slow.example/x") for i in range(200)))
+        await asyncio.sleep(0.05)
+        assert await judge.refusal("good.elsewhere/x") is None
+        assert await judge.refusal("192.0.2.9:5000/x") is None
+        assert "this machine" in str(await judge.refusal("127.0.0.1:5000/x"))
+        assert all("cannot be found in time" in str(one) for one in await slow)
+        more = [judge.refusal(f"a.slow{i}/x") for i in range(40)]
+        assert all("cannot be found in time" in str(one) for one in await asyncio.gather(*more))
+        assert await judge.refusal("good.elsewhere/x") is None, "it was found before"
         assert await asyncio.to_thread(lambda: "elsewhere") == "elsewhere"
-        assert sum(thread.name.startswith("registry") for thread in threading.enumerate()) == 1
         hang.set()
 
     asyncio.run(many())

@@ -17,11 +17,9 @@ import json
 import posixpath
 import re
 import tarfile
-from collections.abc import Iterable, Mapping
-from http import HTTPStatus
+from collections.abc import Mapping
 from pathlib import PurePosixPath
 from typing import Any
-from urllib.parse import urlencode
 
 from .engine_rules import DATA, FOLDER
 

@@ -409,11 +409,11 @@ def _may_be_published(inspected: Any) -> None:
     for bound in ((inspected.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT) or ():
         if refused := published(bound):
             raise RefusedCall(refused)
-        address, port = bound.get("HostIp") or ANYWHERE, bound.get("HostPort")
+        address, port = bound.get("HostIp") or "", bound.get("HostPort")
         if not port:
             raise RefusedCall("it was made by an earlier release, and is published at whatever port: make it anew")
         if is_taken(address, int(port)):
-            raise RefusedCall(f"UDP port {port} of {address}: address already in use")
+            raise RefusedCall(f"UDP port {port} of {address or ANYWHERE}: address already in use")
 
 
 async def _answer(back: asyncio.StreamWriter, status: int, body: bytes, rows: str) -> None:

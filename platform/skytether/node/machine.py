@@ -32,11 +32,14 @@ _ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "arm"}
 _ENGINE_S = 10.0
 _MOST, _MOST_HEAD, _PIECE = 1 << 20, 1 << 16, 1 << 16
 """Bytes of an engine's answer, of the head before it, and of what is read at a time."""
+_CONNECT_AGAIN_S = 0.02
 _MOST_TEXT = 1024
 """Characters of what is asked for of a thing in a list; longer ones are left out."""
 _HEAVY = {"Args", "Cmd", "Entrypoint", "Env", "ExposedPorts", "OnBuild", "Shell", "Volumes"}
 _OURS, _MOST_OF_ONE = "skytether", 4096
 ANYWHERE = "0.0.0.0"  # noqa: S104 (nobody listens)
+_TRIES = 16
+"""For a port that is free for IPv6, too."""
 _MOST_LISTED, _LIST_S = 1 << 17, 30.0
 """Things of a list, and how long it may take to be read [s]."""
 _PLAIN = {"string", "number", "boolean"}
@@ -192,8 +195,9 @@ def listed(
                     if len(found) > _MOST_LISTED or time.monotonic() > until:
                         raise TooMuchError("it has too much to tell")
                 elif found and event in _PLAIN and where.startswith(start) and (key := where[len(start) :]) in keys:
-                    if not isinstance(value, str) or len(value) <= _MOST_TEXT:
-                        found[-1][key] = value
+                    found[-1][key] = value
+                    if isinstance(value, str) and len(value) > _MOST_TEXT:
+                        del found[-1][key]
         except ijson.JSONError as error:
             raise ValueError(f"its answer is no JSON: {error}") from error
     return found
@@ -236,7 +240,7 @@ async def ask_long(
         OSError: It does not answer.
         ValueError: It answers something else.
     """
-    reader, writer = await asyncio.open_unix_connection(path)
+    reader, writer = await asyncio.open_unix_connection(sock=await _connect(path))
     try:
         # By this version an engine says no more than one answer, in one piece.
         content = archive if body is None else json.dumps(body).encode()
@@ -253,9 +257,26 @@ async def ask_long(
         writer.transport.abort()
     if not (found := _STATUS.match(said)) or start < len(b"\r\n\r\n"):
         raise ValueError("it ended before it said whether it did it")
-    rows = (row.partition(":") for row in said[:start].decode("latin-1").split("\r\n")[1:])
-    heads = {name.lower(): value.strip() for name, _, value in rows if name}
+    lines = (line.partition(":") for line in said[:start].decode("latin-1").split("\r\n")[1:])
+    heads = {name.lower(): value.strip() for name, _, value in lines if name}
     return Answer(int(found[1]), heads, bytes(said[start : start + most]))
+
+
+async def _connect(path: str) -> socket.socket:
+    """Connect: asyncio takes a socket for connected where the kernel says that too many wait to be."""
+    made = socket.socket(socket.AF_UNIX)
+    made.setblocking(False)
+    try:
+        while True:
+            try:
+                made.connect(path)
+            except BlockingIOError:
+                await asyncio.sleep(_CONNECT_AGAIN_S)
+            else:
+                return made
+    except BaseException:
+        made.close()
+        raise
 
 
 def lean(content: bytes) -> Any:
@@ -356,7 +377,9 @@ def own_address(host: str, port: int) -> str | None:
 
 
 def is_taken(address: str, port: int) -> bool:
-    """Whether a program of this machine has that UDP port, at that address or at all."""
+    """Whether a program of this machine has that UDP port, at that address or at all; empty: at any address."""
+    if not address:
+        return is_taken(ANYWHERE, port) or (socket.has_ipv6 and is_taken("::", port))
     with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             if ":" in address:
@@ -371,6 +394,13 @@ def is_taken(address: str, port: int) -> bool:
 
 def free_port(address: str) -> int:
     """A UDP port that no program of this machine has, at that address, or at all where it is empty or none of ours."""
+    for _ in range(_TRIES):
+        if not is_taken(address, port := _free(address)):
+            break
+    return port
+
+
+def _free(address: str) -> int:
     with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((address or ANYWHERE, 0))

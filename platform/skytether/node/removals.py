@@ -37,8 +37,9 @@ _GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused."""
 _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
-_MOST_STARTS, _MOST_REMOVALS = 512, 128
-"""Under way at a time: an engine may take its time for each, and whoever asked may be gone meanwhile."""
+_MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN = 512, 128, 4
+"""Under way at a time, and in line for one network: an engine may take its time for each, and whoever asked may be gone
+meanwhile."""
 _MOST_MINE = 1 << 15
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
@@ -105,6 +106,8 @@ class Removals:
         (joined,) = joins or ("",)
         if joined in self._ending:
             raise BusyError(_ENDS)
+        if joined and container not in self._starts and self._joined[joined] >= _MOST_JOIN:
+            raise BusyError("too many containers join that network just now")
         self._kin.meet(things)
         self._mine.add(container)
         if len(self._mine) > _MOST_MINE:

@@ -20,7 +20,18 @@ from ...velocities import VELOCITIES
 from ..dialect import Endpoint
 from ..qos import Qos, follow, history_missed
 from .overrun import QUIET_S, Overrun
-from .side.frames import FIRST_WORD, FOR_ALL, Frame, Kind, control, fresh, numbered, pull_dealt_with, pull_fresh, pull_number
+from .side.frames import (
+    FIRST_WORD,
+    FOR_ALL,
+    Frame,
+    Kind,
+    control,
+    fresh,
+    numbered,
+    pull_dealt_with,
+    pull_fresh,
+    pull_number,
+)
 from .side.outbox import Sender
 
 _log = logging.getLogger(__name__)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Mapping
+from typing import Any
 
 MOST = 256
 """Names of those who left that are known."""
@@ -41,7 +42,7 @@ class Comers:
         """Whoever is here may be back, and has been told so."""
         self._open.clear()
 
-    def is_anybody_back(self, listeners: Mapping[Hashable, str]) -> bool:
+    def is_anybody_back(self, listeners: Mapping[Any, str]) -> bool:
         """Whether somebody came who may have been there before, or is awaited.
 
         Whoever comes may be one who left by another name. A name that is there twice is of one who was killed, too, and
