@@ -111,14 +111,14 @@ def test_what_had_not_left_the_wheels_were_not_told(both):
     first, second = both
     for i in range(3):
         first.turn(1.0 + i * PERIOD, FAST)
-    first.wheels.held = Sent(1.0, lost=True, stuck=True)  # what was written then had left, and nothing since
+    first.wheels.held = Sent(1.0, 1.0, lost=True, stuck=True)  # what was written then had left, and nothing since
     assert not first.turn(1.06, FAST)
     assert first.board.newest().told == LastCommand(first.wheels.told[0], 1.0)
     assert second.turn(1.07) is False
     assert second.turn(1.09) is True
     assert second.wheels.told[-1].linear == pytest.approx(0.4 - 2.0 * 0.09), "from what they were told really"
     first.turn(1.1, FAST)  # sees that, as if they were told so
-    second.wheels.held = Sent(-1.0, lost=True, stuck=True)
+    second.wheels.held = Sent(-1.0, -1.0, lost=True, stuck=True)
     assert not second.turn(1.11)
     assert second.board.newest().told.at == 1.0
     assert not first.turn(1.12, FAST)
@@ -131,11 +131,11 @@ def test_what_goes_on_from_something_leaves_while_the_wheels_turn_by_that_or_nev
     """The first stood still, and its program had before; what the second said left 0.17 s after what they heard."""
     first, second = both
     first.turn(1.0, FAST)
-    first.wheels.held = Sent(1.0)
+    first.wheels.held = Sent(1.0, 1.0)
     for i in range(1, 3):
         assert first.turn(1.0 + i * PERIOD, FAST)
     assert first.wheels.untils[-1] == pytest.approx(1.04 + FRESH * PERIOD), "or old"
-    second.wheels.held = Sent(-inf)
+    second.wheels.held = Sent(-inf, -inf)
     assert not second.turn(1.075)
     assert second.turn(1.091)
     assert second.wheels.told[-1].linear > 0
@@ -148,14 +148,14 @@ def test_what_goes_on_from_something_leaves_while_the_wheels_turn_by_that_or_nev
 
 def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_left(both):
     first, _ = both
-    first.wheels.held = Sent(-inf)
+    first.wheels.held = Sent(-inf, -inf)
     assert first.turn(2.0, FAST)
     assert first.wheels.told == [STANDSTILL]
     for i in range(1, 5):
         assert first.turn(2.0 + i * PERIOD, FAST)
     assert first.wheels.told[-1].linear > 0
     assert first.wheels.untils[-1] == pytest.approx(2.0 + PATIENCE)
-    first.wheels.held = Sent(2.08)
+    first.wheels.held = Sent(2.08, 2.08)
     assert first.turn(2.1, FAST)
     assert first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
 
@@ -164,10 +164,10 @@ def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):
     """The wheels' subscription was made anew just before the first was held up: their first word was 0.4 m/s."""
     first, second = both
     for one in (first, second):
-        one.wheels.held = Sent(1.0)
+        one.wheels.held = Sent(1.0, 1.0)
     assert first.turn(1.0, FAST)
     first.turn(1.02, FAST)
-    first.wheels.held = Sent(1.0, lost=True)  # its program knew of the one who came
+    first.wheels.held = Sent(1.0, 1.0, lost=True)  # its program knew of the one who came
     second.wheels.nodes = frozenset({"/base again"})
     assert not second.turn(1.055)
     assert second.turn(1.071)
@@ -190,7 +190,7 @@ def test_what_could_not_be_published_the_wheels_were_not_told_and_are_told_to_st
     """Publishing failed for 2 s, and the first that did not was full speed."""
     first, _ = both
     first.turn(1.0, FAST)
-    first.wheels.held = Sent(1.0, lost=True)
+    first.wheels.held = Sent(1.0, 1.0, lost=True)
     for i in range(1, 20):
         assert first.turn(1.0 + i * PERIOD, FAST)
     assert first.wheels.told[-1] == STANDSTILL

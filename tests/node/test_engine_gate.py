@@ -76,6 +76,8 @@ class Engine:
         """What orchestrators have, beside the one container: by ids and names what is said of it."""
         self.unlisted = False
         """It lists no containers."""
+        self.refuses: set[str] = set()
+        """What it is asked, and answers 409 to."""
         self.slow: dict[str, threading.Event] = {}
         """By what it is asked, what it waits for before it answers."""
         self.digests: list[str] = []
@@ -132,7 +134,10 @@ class Engine:
                         name not in engine.networks,
                         json.dumps({"Labels": engine.networks.get(name), "Containers": {"of others": {}}}).encode(),
                     )
-                self.send_response(404 if missing else 201 if "/containers/create" in self.path else 200)
+                refused = f"{self.command} {self.path}" in engine.refuses
+                self.send_response(
+                    409 if refused else 404 if missing else 201 if "/containers/create" in self.path else 200
+                )
                 asked = parse_qs(urlsplit(self.path).query).get("path", [""])[0]
                 stat = {
                     "mode": 1 << 27 if asked in engine.links else 1 << 25 if asked in engine.pipes else 0o644,
@@ -1162,6 +1167,17 @@ def test_whose_network_is_joined_is_paused_meanwhile_and_not_ended(
         assert b"200 OK" in await ended
 
     asyncio.run(run())
+
+
+def test_a_container_that_somebody_else_paused_stays_paused(engine: Engine) -> None:
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+    engine.refuses = {f"POST /containers/{X}/pause"}
+
+    async def run() -> None:
+        assert b"409" in await Site(engine).ask(f"POST /v1.41/containers/{Y}/start")
+
+    asyncio.run(run())
+    assert f"POST /containers/{X}/unpause" not in engine.lines
 
 
 def test_who_ends_a_container_goes_before_those_that_wait_to_join_its_network(engine: Engine) -> None:

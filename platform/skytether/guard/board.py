@@ -51,7 +51,7 @@ class Entry(NamedTuple):
     claim: float = nan
     """Since when it wants to tell the wheels what the other one has told them so far [s]; NaN: it does not."""
     left_at: float = -inf
-    """When the last was told that is known to have left, or the first after a standstill [s].
+    """When the last was told that is known to have left, or been heard, or the first after a standstill [s].
 
     The wheels have heard something after that, or nothing since.
     """

@@ -71,6 +71,8 @@ class Sent(NamedTuple):
 
     left_at: float
     """When the last was written that is known to have left [s]."""
+    heard_at: float
+    """The same, and to have been acknowledged where those who turn the wheels do that [s]."""
     lost: bool = False
     """What was written after it never does."""
     stuck: bool = False
@@ -277,7 +279,7 @@ class Teller:
         sent = self._sent
         if sent is None:
             return
-        self._left_at = max(self._left_at, min(sent.left_at, self._own.at))
+        self._left_at = max(self._left_at, min(sent.heard_at, self._own.at))
         if not sent.lost:
             return
         while self._written and self._written[-1].at > sent.left_at:

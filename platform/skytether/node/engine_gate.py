@@ -75,7 +75,7 @@ _KNOWN = 4096
 """Containers that are remembered to be ours."""
 _MOST_TOLD, _TOLD_S = 20, 600.0
 """Refusals that are logged within a while: a log has room for others, too."""
-_MOST_CREATES = 256
+_MOST_CREATES = 64
 """Containers that are made at a time."""
 _MADE_S, _MOST_NETWORKS = 60.0, 12
 """For a network to be made [s], and how many of ours there are: an engine has room for 31 in all, and whoever could
@@ -326,10 +326,12 @@ class EngineGate:
         found = ((said.get("HostConfig") or {}).get("PortBindings") or {}).get(PORT)
         for bound in found if isinstance(found, list) else ():
             bound["HostPort"] = bound.get("HostPort") or str(free_port(bound.get("HostIp") or ""))
+        text = json.dumps(said).encode()
+        del said, found  # of what was read Python keeps twelve times as much
         if self._creates.locked():
             raise RefusedCall("too many containers are being made", HTTPStatus.SERVICE_UNAVAILABLE)
         async with self._creates:  # however long it takes
-            answer = await self._tried(ask_long(self._engine, target, method="POST", body=said))
+            answer = await self._tried(ask_long(self._engine, target, method="POST", text=text))
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
             described = await self._ask(f"/containers/{made}/json", most=_MOST_DESCRIBED + 1)

@@ -222,6 +222,7 @@ async def ask_long(
     method: str,
     archive: bytes = b"",
     body: Any = None,
+    text: bytes = b"",
     headers: Mapping[str, str] | None = None,
     most: int = _MOST,
 ) -> Answer:
@@ -233,6 +234,7 @@ async def ask_long(
         method: As HTTP names it.
         archive: Sent, unless it is empty.
         body: Sent as JSON in its place, unless it is None.
+        text: The same, as JSON already.
         headers: More of them.
         most: Bytes of the answer, which is cut off there.
 
@@ -243,7 +245,7 @@ async def ask_long(
     reader, writer = await asyncio.open_unix_connection(sock=await _connect(path))
     try:
         # By this version an engine says no more than one answer, in one piece.
-        content = archive if body is None else json.dumps(body).encode()
+        content = archive or text if body is None else json.dumps(body).encode()
         kind = "application/x-tar" if archive else "application/json"
         given = {"Host": "engine", **({"Content-Type": kind} if content else {}), **(headers or {})}
         rows = "".join(f"{key}: {value}\r\n" for key, value in given.items())

@@ -77,8 +77,8 @@ class Removals:
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
         """Containers that this program had started: whom those meet that another one started, it does not see."""
-        self._puts: set[str] = set()
-        """Containers into which something is being put."""
+        self._puts: Counter[str] = Counter()
+        """How much is being put into each container."""
         self._joined: Counter[str] = Counter()
         """How many join the network of each just now."""
         self._pauses: dict[str, asyncio.Lock] = {}
@@ -101,7 +101,7 @@ class Removals:
         # From here to the task nobody else comes between.
         if len(self._starts) >= _MOST_STARTS:
             raise BusyError("too many containers start")
-        if container in self._puts:
+        if self._puts[container]:
             raise BusyError("something is being put into it")
         (joined,) = joins or ("",)
         if joined in self._ending:
@@ -132,13 +132,15 @@ class Removals:
             async with self._pauses.setdefault(joined, asyncio.Lock()):
                 if joined in self._ending:
                     raise BusyError(_ENDS)
+                held = None
                 try:
                     held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if held.status >= HTTPStatus.BAD_REQUEST:
-                        return held  # it has ended, or is about to
+                        return held  # it has ended, or is about to, or somebody else has it paused
                     return await ask_long(self._engine, path, method="POST")
                 finally:
-                    await self._go_on(joined)
+                    if held is None or held.status < HTTPStatus.BAD_REQUEST:
+                        await self._go_on(joined)
         finally:
             self._has_joined(joined)
 
@@ -195,10 +197,15 @@ class Removals:
         del answer  # it may be large, and the engine may take any time
         if container in self._mine or not takes:
             return None
-        self._puts.add(container)
+        self._puts[container] += 1
         task = begun(ask_long(self._engine, path, method="PUT", archive=archive))
-        task.add_done_callback(lambda _: self._puts.discard(container))
+        task.add_done_callback(lambda _: self._has_put(container))
         return await asyncio.shield(task)  # the engine goes on with it, whoever waits for it: no start overtakes it
+
+    def _has_put(self, container: str) -> None:
+        self._puts[container] -= 1
+        if not self._puts[container]:
+            del self._puts[container]
 
     async def remove_container(self, container: str, path: str, without: str) -> Answer:
         """Have the engine remove one, with its volumes if nobody else can have a folder of these.

@@ -102,6 +102,7 @@ class Publication(Handle):
     renewed = None
     lost = False
     left_at: float = inf
+    heard_at: float = inf
     waits = False
     """Whether a message may wait for room in the outbox, instead of being dropped where Zenoh has none."""
 

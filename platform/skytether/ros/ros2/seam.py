@@ -76,6 +76,11 @@ class Publication(Handle, Protocol):
         """When the last was put that is known to have been published, of those with ``fresh_s`` [s]."""
         ...
 
+    @property
+    def heard_at(self) -> float:
+        """The same, and to have been acknowledged by all who do that in time [s]."""
+        ...
+
     def put(
         self, payload: bytes | memoryview, until: float = inf, renewed: int | None = None, *, first: bool = False
     ) -> bool:

@@ -9,6 +9,7 @@ begin got no answer is left as it is where another one leads by now, who may hav
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -72,7 +73,7 @@ class Fence:
         with self._engine.asked():
             said: dict[str, Any] = self._engine.api().volumes({"label": [f"{OWNER}={self._owner}", EPOCH]})
         volumes = {str(v["Name"]): str((v.get("Labels") or {}).get(EPOCH, "")) for v in said["Volumes"] or ()}
-        return {int(epoch): name for name, epoch in volumes.items() if epoch.isdecimal()}
+        return {int(epoch): name for name, epoch in volumes.items() if re.fullmatch("[0-9]{1,18}", epoch)}
 
     def _remove(self, names: Any) -> None:
         with self._engine.asked():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -17,6 +18,8 @@ from .options import DockerOptions
 
 _LONGEST = 200
 """Characters of a word that an engine says of itself, and words of a list."""
+
+_NUMBER = re.compile("[0-9]{1,18}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +94,8 @@ def _is_word(value: object) -> bool:
 def parse(inspected: Mapping[str, Any]) -> ContainerState | None:
     """A container out of the engine's description; None: it is not one of ours."""
     labels = inspected["Config"].get("Labels") or {}
-    if INSTANCE not in labels or not labels.get(ATTEMPT, "").isdecimal():
+    attempt = _number(labels.get(ATTEMPT))
+    if INSTANCE not in labels or attempt is None:
         return None
     state = inspected["State"]
     port = published_port(inspected)
@@ -100,14 +104,14 @@ def parse(inspected: Mapping[str, Any]) -> ContainerState | None:
     return ContainerState(
         id=inspected["Id"],
         instance=labels[INSTANCE],
-        attempt=int(labels[ATTEMPT]),
+        attempt=attempt,
         status=state["Status"],
         exit_code=state["ExitCode"],
         out_of_memory=state["OOMKilled"],
         limits=pull_limits(inspected["HostConfig"]),
-        host_port=port or (_port(labels[PORT]) if labels.get(PORT, "").isdecimal() else None),
+        host_port=port or _port(labels.get(PORT)),
         ill=_complaint(health.get("Log") or ()) if health.get("Status") == "unhealthy" else "",
-        gpus=frozenset(int(number) for number in labels.get(GPUS, "").split(",") if number.isdecimal()),
+        gpus=frozenset(gpu for number in labels.get(GPUS, "").split(",") if (gpu := _number(number)) is not None),
         volume=volumes.pop(DATA_FOLDER, "") or volumes.pop(DATA_BEFORE, ""),
         other_volumes=tuple(volumes.values()),
         namespace=labels.get(NAMESPACE, ""),
@@ -122,8 +126,13 @@ def published_port(inspected: Mapping[str, Any]) -> int | None:
 
 def _port(told: Any) -> int | None:
     """A robot is sent there, so it is one, or none."""
-    port = int(told)
-    return port if 0 < port < 1 << 16 else None
+    port = _number(told)
+    return port if port and port < 1 << 16 else None
+
+
+def _number(told: Any) -> int | None:
+    """Of a label, which an image may have, too; None: it is none, or so large that Python does not read it."""
+    return int(told) if isinstance(told, str) and _NUMBER.fullmatch(told) else None
 
 
 def parse_helper(inspected: Mapping[str, Any]) -> Helper | None:

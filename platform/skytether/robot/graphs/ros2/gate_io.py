@@ -113,7 +113,9 @@ class Ros2Wheels(RosWheels[GraphNode]):
         stuck = self._publication.stuck
         if stuck and self._place is not None:  # who would take over may be dead
             self._place.end_speaker(self._speaks_s)
-        return Sent(self._publication.left_at, stuck or self._publication.lost, stuck)
+        left_at = self._publication.left_at
+        heard_at = self._publication.heard_at if self._way.need_acknowledgements else left_at
+        return Sent(left_at, heard_at, stuck or self._publication.lost, stuck)
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

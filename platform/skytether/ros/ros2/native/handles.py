@@ -139,6 +139,8 @@ class Publication(Handle):
         """Of those, as this program counts them."""
         self.left_at = -inf
         """When the last was put that is known to have been published, of those with `fresh_s` [s]."""
+        self.heard_at = -inf
+        """The same, and to have been acknowledged by all who do that in time [s]."""
         self.lost = False
         """Whether the program has dealt with the last of those, and not published it."""
         self._heard = False
@@ -208,6 +210,8 @@ class Publication(Handle):
             while self._waiting and self._waiting[0][0] <= number:
                 over.append(self._waiting.popleft()[1])
             new, self._published = published - self._published, published
+            if over and not unread_s:  # before this one
+                self.heard_at = self.left_at
             if over:
                 self.lost = new <= 0
             if new > 0 and over:
