@@ -31,14 +31,15 @@ class GraphClock:
         self._node = node
         self._clock = clock
         self._told = 0.0
+        # A hash takes its time, which a velocity that is stamped first must not wait for.
+        self._topic = Endpoint(Kind.SUBSCRIPTION, TOPIC, TYPE, hash_of(TYPE, "cdr"), Qos(reliable=False, depth=1))
         self._handle: Handle | None = None
 
     def __call__(self) -> float:
         if not self._node.sim_time:
             return self._clock()
         if self._handle is None:
-            endpoint = Endpoint(Kind.SUBSCRIPTION, TOPIC, TYPE, hash_of(TYPE, "cdr"), Qos(reliable=False, depth=1))
-            self._handle = self._node.subscribe(endpoint, self._on_clock)
+            self._handle = self._node.subscribe(self._topic, self._on_clock)
         return self._told
 
     def close(self) -> None:

@@ -98,6 +98,8 @@ class Ros2Wheels(RosWheels[GraphNode]):
         """Wheels: the nodes that listen, of those that turn the wheels; none while they cannot be told anything."""
         if self._publication.refused:
             return frozenset()
+        if self._way.cmd_vel_type == TwistStamped.TYPE:
+            self._clock()  # or the gate would hear no time before its first velocity
         lives = self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes)
         self._renewed = self._publication.renewed
         if self._nodes:

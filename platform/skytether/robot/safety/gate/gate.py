@@ -31,7 +31,7 @@ from skytether.guard.mailbox import bind
 from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
-from skytether.messages import Twist, warm
+from skytether.messages import Twist, TwistStamped, warm
 from skytether.robot.graphs.wheels_watch import NOBODY, Others, WatchesWheels
 from skytether.robot.graphs.wheels_watch import sentence as sentence_of_others
 from skytether.robot.log_throttle import LogThrottle
@@ -268,7 +268,7 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm([*config.kinds().values(), Twist], config.encoding)
+    warm([*config.kinds().values(), Twist, TwistStamped], config.encoding)
     refused = privileges.acquire(privileges.GATE)
     notices = LogThrottle(_log)
     estop = socket.socket(fileno=int(sys.argv[4])) if len(sys.argv) > 4 else None

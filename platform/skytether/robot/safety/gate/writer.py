@@ -26,7 +26,7 @@ from skytether.guard.settings import thaw
 from skytether.guard.teller import SPEAKS, Teller, repeat_s
 from skytether.guard.velocity import STANDSTILL
 from skytether.guard.watch import Watch
-from skytether.messages import Twist, warm
+from skytether.messages import Twist, TwistStamped, warm
 from skytether.robot.log_throttle import LogThrottle
 
 from ...graphs.gate_io import Wheels
@@ -157,7 +157,7 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_S)
     guard = socket.socket(fileno=int(sys.argv[1]))
     guard.setblocking(False)
-    warm([Twist], config.encoding)
+    warm([Twist, TwistStamped], config.encoding)
     for sentence in privileges.acquire(privileges.WRITER):
         _log.info("%s", sentence)
     board = Board(int(sys.argv[3]))
