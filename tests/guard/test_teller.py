@@ -160,6 +160,19 @@ def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_lef
     assert first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
 
 
+def test_wheels_that_are_not_known_to_hear_are_told_to_stand_until_they_are(both):
+    """The first standstill was missed, and what they heard first was some way up the ramp."""
+    first, _ = both
+    first.wheels.held = Sent(2.0, 2.0, unheard=True)
+    for i in range(10):
+        first.wheels.held = Sent(2.0 + (i - 1) * PERIOD, 2.0 + (i - 1) * PERIOD, unheard=True)
+        assert first.turn(2.0 + i * PERIOD, FAST)
+    assert set(first.wheels.told) == {STANDSTILL}
+    first.wheels.held = Sent(2.18, 2.18)
+    assert first.turn(2.2, FAST)
+    assert first.wheels.told[-1].linear == pytest.approx(1.0 * PERIOD)
+
+
 def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):
     """The wheels' subscription was made anew just before the first was held up: their first word was 0.4 m/s."""
     first, second = both

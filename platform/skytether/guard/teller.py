@@ -77,6 +77,8 @@ class Sent(NamedTuple):
     """What was written after it never does."""
     stuck: bool = False
     """Who sends it stands still: nothing can be written now."""
+    unheard: bool = False
+    """Of those who turn the wheels somebody is not known to hear yet."""
 
 
 class Wheels(Protocol):
@@ -199,7 +201,8 @@ class Teller:
         if not stopped and self._waits(now):
             return False
         self.unread = self._wheels.unread()
-        velocity, _ = self._watch.want(now, stopped or bool(self.unread))
+        missed = self._sent is not None and self._sent.unheard  # a standstill would be missed, and not what follows
+        velocity, _ = self._watch.want(now, stopped or missed or bool(self.unread))
         other = _OTHER[self._role]
         spoke = self._board.of(other).told.at
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over

@@ -87,8 +87,8 @@ _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0
 """What an engine may take to say how large all is that it has [s]."""
-_MUCH, _TAKEN_S = 1 << 16, 10.0
-"""Bytes of that, and for how long whoever asked for more of them holds up others [s]."""
+_MOST_WEIGHS, _TAKEN_S = 8, 10.0
+"""Ways that are told that at a time, and for how long each may take to take it [s]."""
 _WEIGHED, _OWNED, _SIZE = ("Volumes.item", "VolumeUsage.Items.item"), f"Labels.{OWNER}", "UsageData.Size"
 
 
@@ -116,7 +116,10 @@ class EngineGate:
         self._removals = Removals(engine)
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
-        self._weighing, self._making = asyncio.Lock(), asyncio.Lock()
+        self._weighing: asyncio.Task[bytes] | None = None
+        self._weighs = 0
+        """Ways that wait for that, or have it and have not taken it yet."""
+        self._making = asyncio.Lock()
         self._creates = asyncio.Semaphore(_MOST_CREATES)
         asking = Asking(engine)
         self._ask, self._asked = asking.ask, asking.asked
@@ -334,9 +337,15 @@ class EngineGate:
             answer = await self._tried(ask_long(self._engine, target, method="POST", text=text))
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
-            described = await self._ask(f"/containers/{made}/json", most=_MOST_DESCRIBED + 1)
-            if len(described.content) > _MOST_DESCRIBED:
-                await self._ask(f"/containers/{made}?force=1&v=1", method="DELETE", patience=_END_S)
+            try:
+                described = await self._ask(f"/containers/{made}/json", patience=_END_S, most=_MOST_DESCRIBED + 1)
+                large = len(described.content) > _MOST_DESCRIBED
+            except RefusedCall:
+                large = True  # for all that is known
+            if large:
+                whole = f"/containers/{made}?force=1"
+                removes = partial(self._removals.remove_container, made, f"{whole}&v=1", whole)
+                await self._tried(self._removals.end(made, removes))  # it may run by now
                 raise RefusedCall(
                     f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says"
                 )
@@ -359,24 +368,31 @@ class EngineGate:
         return status, json.dumps(found).encode(), JSON
 
     async def _weigh(self, target: str, back: asyncio.StreamWriter) -> None:
-        """Tell of what there is what is ours: one at a time, if it is much until who asked has taken it."""
-        async with self._weighing:
-            there = await self._tried(
-                asyncio.to_thread(listed, self._engine, target, _WEIGHED, ("Name", _OWNED, _SIZE), patience=_WEIGH_S)
-            )
-            ours = [
-                {"Name": one["Name"], "Labels": {OWNER: one[_OWNED]}, "UsageData": {"Size": one[_SIZE]}}
-                for one in there
-                if one.keys() >= {"Name", _OWNED, _SIZE}
-            ]
-            del there
-            told = json.dumps({"Volumes": ours}).encode()
-            del ours
-            if len(told) > _MUCH:
-                async with asyncio.timeout(_TAKEN_S):
-                    await _answer(back, HTTPStatus.OK, told, JSON)
-                return
-        await _answer(back, HTTPStatus.OK, told, JSON)
+        """Tell of what there is what is ours. It may be much: few have that at a time, of one look at it."""
+        if self._weighs >= _MOST_WEIGHS:
+            raise RefusedCall("too many ask how large all is", HTTPStatus.SERVICE_UNAVAILABLE)
+        self._weighs += 1
+        try:
+            if self._weighing is None or self._weighing.done():
+                self._weighing = begun(self._tried(self._weigh_all(target)))
+            async with asyncio.timeout(_WEIGH_S):
+                told = await asyncio.shield(self._weighing)
+            async with asyncio.timeout(_TAKEN_S):
+                await _answer(back, HTTPStatus.OK, told, JSON)
+        finally:
+            self._weighs -= 1
+
+    async def _weigh_all(self, target: str) -> bytes:
+        keys = ("Name", _OWNED, _SIZE)
+        there = await asyncio.to_thread(listed, self._engine, target, _WEIGHED, keys, patience=_WEIGH_S)
+        there.reverse()
+        said = bytearray()
+        while there:  # let go of one by one, for it may be much
+            name, owner, size = map(there.pop().get, keys)
+            if isinstance(name, str) and isinstance(owner, str) and name.isascii() and owner.isascii():
+                one = {"Name": name, "Labels": {OWNER: owner}, "UsageData": {"Size": size}}
+                said += (b", " if said else b"") + json.dumps(one).encode()
+        return b'{"Volumes": [' + bytes(said) + b"]}"
 
     async def _is_ours(self, subject: Subject) -> bool:
         """Whether an orchestrator made it, or there is none: the engine says that itself."""

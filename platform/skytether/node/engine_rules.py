@@ -410,8 +410,9 @@ def _labels(given: Mapping[str, Any]) -> str | None:
     labels = _at(given, "Labels")
     if labels.get(OWNER) == NOBODY:  # which is the node's own word: no orchestrator could remove it any more
         return f"the label {OWNER} of what is nobody's"
-    if len(str(labels.get(OWNER, ""))) > _MOST_OWNER:  # it is told again and again
-        return f"a label {OWNER} of more than {_MOST_OWNER} characters"
+    owner = str(labels.get(OWNER, ""))
+    if len(owner) > _MOST_OWNER or not owner.isascii():  # it is told again and again
+        return f"a label {OWNER} of more than {_MOST_OWNER} plain characters"
     if len(labels) > _MOST_LABELS:
         return f"more than {_MOST_LABELS} labels"
     much = sum(len(key) + len(str(value)) for key, value in labels.items()) > _MOST_LABELLED

@@ -33,7 +33,9 @@ class Names:
         if asked is None or asked.done():
             self._asked = {name: one for name, one in self._asked.items() if not one.done()}
             asked = self._asked[host] = self._threads.submit(_addresses, host)
-        return await asyncio.shield(asyncio.wrap_future(asked))
+        found = asyncio.wrap_future(asked)
+        found.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody may wait by then
+        return await asyncio.shield(found)
 
     def close(self) -> None:
         """Ask for nothing more."""

@@ -69,9 +69,9 @@ class Registries:
     async def _find(self, host: str) -> list[str]:
         with contextlib.suppress(ValueError):
             return [str(ipaddress.ip_address(host))]
-        domain = _domain(host)
-        if sum(_domain(name) == domain for name in self._names.asked - {host}) >= _MOST_OF_DOMAIN:
-            raise TimeoutError
+        domain, others = _domain(host), self._names.asked - {host}
+        if len(others) >= _MOST or sum(_domain(name) == domain for name in others) >= _MOST_OF_DOMAIN:
+            raise TimeoutError  # rather than wait behind those
         async with asyncio.timeout(self._resolve_s):
             return [address.partition("%")[0] for address in await self._names.find(host)]
 

@@ -73,6 +73,7 @@ class Removals:
         self._kin = Kin()
         self._looking = asyncio.Lock()
         self._looked_back, self._began = False, time.time()
+        self._learning: asyncio.Task[None] | None = None
         self._starts: dict[str, asyncio.Task[Answer]] = {}
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
@@ -297,12 +298,15 @@ class Removals:
     async def look_back(self) -> None:
         """Once, before anything is made or started: of what runs already nobody knows what it has met."""
         if not self._looked_back:
-            async with self._looking:
-                await self._learn()
+            if self._learning is None or self._learning.done():
+                self._learning = begun(self._learn())
+            await asyncio.shield(self._learning)  # to its end, whoever waits for it
 
     async def _learn(self) -> None:
-        if self._looked_back:  # meanwhile
-            return
+        async with self._looking:
+            await self._learn_all()
+
+    async def _learn_all(self) -> None:
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}

@@ -261,6 +261,77 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
         wheels.close()
 
 
+SWAPS = """
+from geometry_msgs.msg import Twist
+def listen(number):
+    return node.create_subscription(Twist, "/cmd_vel", lambda m: say([number, m.linear.x]), 10)
+def work():
+    listening = listen(0)
+    for number in range(1, 9):
+        time.sleep(0.7)
+        node.destroy_subscription(listening)
+        listening = listen(number)
+    time.sleep(0.7)
+    say("done")
+threading.Thread(target=work, daemon=True).start()
+"""
+
+
+class Drives:
+    """Drives at 0.5 m/s, and tells who comes to stand first, as guard and gate do."""
+
+    def __init__(self, node, awaited=()):
+        endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(reliable=True))
+        self.wheels = node.publish(endpoint, fresh_s=0.1, awaited=awaited)
+        self._stand, self._forward = encode(Twist()), encode(Twist(linear=Vector3(x=0.5)))
+        self._seen = None
+
+    def turn(self):
+        time.sleep(0.02)
+        if self.wheels.renewed != self._seen or not self.wheels.heard or self.wheels.unread_s > 0.1:
+            self._seen = self.wheels.renewed
+            self.wheels.put(self._stand, first=True)
+        else:
+            self.wheels.put(self._forward, renewed=self._seen)
+
+
+@pytest.mark.parametrize("awaited", [(), ("/base",)], ids=["anybody", "named"])
+def test_a_subscription_that_is_made_anew_at_once_hears_a_standstill_first(ros2_nodes, awaited):
+    """Within 2 ms: the number of those who listen was never another one."""
+    with RclpyNode() as node:
+        drives = Drives(node, awaited)
+        base = ros2_nodes.start(SWAPS, name="base")
+        until(lambda: drives.turn() or base.heard.extend(base.all()) or "done" in base.heard, "eight swaps")
+        drives.wheels.close()
+    first = {}
+    for number, x in (said for said in base.heard if said != "done"):
+        first.setdefault(number, x)
+    assert len(first) >= 8
+    assert set(first.values()) == {0.0}, [said for said in base.heard if said != "done" and first[said[0]]][:40]
+    assert [8, 0.5] in base.heard
+
+
+@pytest.mark.parametrize("awaited", [(), ("/base",)], ids=["anybody", "named"])
+def test_another_process_of_a_node_that_still_listens_hears_a_standstill_first(ros2_nodes, awaited):
+    """A rolling restart: its name is known later than that it listens."""
+    listens = """
+from geometry_msgs.msg import Twist
+node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
+"""
+    with RclpyNode() as node:
+        drives = Drives(node, awaited)
+        base = ros2_nodes.start(listens, name="base")
+        for _ in range(3):
+            until(lambda base=base: drives.turn() or base.heard.extend(base.all()) or 0.5 in base.heard, "a velocity")
+            after = ros2_nodes.start(listens, name="base")
+            until(lambda after=after: drives.turn() or after.heard.extend(after.all()) or 0.5 in after.heard, "one")
+            assert after.heard[0] == 0.0
+            base.process.send_signal(signal.SIGINT)
+            base.process.wait(10)
+            base = after
+        drives.wheels.close()
+
+
 def test_when_ros_is_shut_down_under_our_node_that_is_named_and_it_comes_back(ros2_nodes, monkeypatch, tmp_path):
     """The context is shut down from within, as a signal handler of a library's would."""
     (tmp_path / "sitecustomize.py").write_text(

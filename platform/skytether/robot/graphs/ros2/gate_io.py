@@ -115,9 +115,10 @@ class Ros2Wheels(RosWheels[GraphNode]):
         stuck = self._publication.stuck
         if stuck and self._place is not None:  # who would take over may be dead
             self._place.end_speaker(self._speaks_s)
-        left_at = self._publication.left_at
-        heard_at = self._publication.heard_at if self._way.need_acknowledgements else left_at
-        return Sent(left_at, heard_at, stuck or self._publication.lost, stuck)
+        publication, acknowledged = self._publication, self._way.need_acknowledgements
+        heard_at = publication.heard_at if acknowledged else publication.left_at
+        lost = stuck or publication.lost
+        return Sent(publication.left_at, heard_at, lost, stuck, unheard=acknowledged and not publication.heard)
 
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]

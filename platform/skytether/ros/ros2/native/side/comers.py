@@ -29,11 +29,6 @@ class Comers:
         """Who left and has not come back, the one who left first at first; empty: somebody whose name nobody knew."""
 
     @property
-    def unnamed(self) -> bool:
-        """Whether somebody is there whose name is not known yet."""
-        return "" in self._here.values()
-
-    @property
     def doubtful(self) -> bool:
         """Whether somebody came whose name is not known yet, and who may be back."""
         return bool(self._open)

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
 
 from . import graph
 from .frames import FIRST_WORD, FOR_ALL, Frame, dealt_with
@@ -36,6 +35,7 @@ class FreshPublisher:
         node: Of rclpy, which has the publisher.
         publisher: Reliable or not.
         lifespan_s: Its messages' [s].
+        came: How often anybody began to listen, as `Hearing.look` has it.
         awaited: See `Hearing`.
         speaking: Entered while it is looked whether a message is still fresh, and while it is published.
         now: The clock that the agent has, too [s].
@@ -46,6 +46,7 @@ class FreshPublisher:
         node: Any,
         publisher: Any,
         lifespan_s: float,
+        came: Callable[[], int | None],
         awaited: Collection[str],
         speaking: Speaking,
         now: Callable[[], float],
@@ -56,7 +57,7 @@ class FreshPublisher:
         self._lock = threading.Lock()
         """Of what is known of who hears, and was published."""
         self._nodes = partial(graph.listeners, node, publisher.topic_name)
-        self._came = _count_matches(publisher)
+        self._came = came
         self._published, self._published_at = 0, now()
         self._number = 0
         self._read = True
@@ -83,11 +84,14 @@ class FreshPublisher:
         if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
             self._read = _has_been_read(publisher, _AT_ONCE)
         with self._lock:
-            came = self._came()
-            hearing.update(publisher.get_subscription_count(), came, self._read, now, self._nodes)
+            came, there = self._came(), self._nodes()
+            hearing.update(publisher.get_subscription_count(), came, self._read, now, there)
         with self._speaking():
             known = renewed in (FOR_ALL, FIRST_WORD) or (
-                renewed == hearing.renewed and came == self._came() and not hearing.holds
+                renewed == hearing.renewed
+                and not hearing.holds
+                and came == self._came()
+                and there.keys() == self._nodes().keys()  # DDS shows who comes, connects him, and then counts that
             )
             new = bool(known and self._now() <= until)
             if new:
@@ -102,7 +106,7 @@ class FreshPublisher:
         """See who listens, while perhaps nothing is published; whether that is somebody who is to hear a first word."""
         with self._lock:
             before = self._hearing.renewed
-            self._hearing.look(self._publisher.get_subscription_count(), self._came(), self._now(), self._nodes)
+            self._hearing.look(self._publisher.get_subscription_count(), self._came(), self._now(), self._nodes())
             return self._hearing.renewed != before
 
     def answer(self, channel: int) -> Frame:
@@ -144,20 +148,6 @@ class FreshPublisher:
         ours = (self._node.get_name(), self._node.get_namespace())
         infos = self._node.get_publishers_info_by_topic(self._publisher.topic_name)
         return [(info.node_name, info.node_namespace) for info in infos].count(ours) > 1
-
-
-def _count_matches(publisher: Any) -> Callable[[], int | None]:
-    """How often anybody began to listen to a publisher; None: not told, as by Humble.
-
-    A callback would be told by the executor, when something may have been published since.
-    """
-    try:
-        kind = rclpy_implementation.rcl_publisher_event_type_t.RCL_PUBLISHER_MATCHED
-        with publisher.handle:
-            event = rclpy_implementation.EventHandle(publisher.handle, kind)
-    except (AttributeError, rclpy_implementation.UnsupportedEventTypeError):
-        return lambda: None
-    return lambda: int(event.take_event().total_count)
 
 
 def _has_been_read(publisher: Any, within: Duration) -> bool:

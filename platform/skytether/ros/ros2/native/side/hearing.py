@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
+from typing import Any
 
 from .comers import Comers
 
-Nodes = Callable[[], Mapping[str, str]]
-"""Gives names of those who listen, empty where it is not known, each under what is its subscription's alone."""
+Nodes = Mapping[Any, str]
+"""Names of those who listen, empty where it is not known, each under what is its subscription's alone."""
+COMES_S = 0.05
+"""For DDS to connect somebody whom it shows."""
 DOUBT_S = 0.5
 """For the name of who came to be known; by then he counts as one who is to hear a first word."""
 SILENT_S = 0.5
@@ -35,19 +38,22 @@ class Hearing:
         self._read_at: float | None = None
         """When all had been acknowledged last, where it was at some time [s]."""
         self._told_since: float | None = None
-        """Since when somebody listens to what was published [s]."""
+        """Since when those who listen are told something, who came last too [s]; None: they are not yet."""
         self._listeners = 0
         self._came: int | None = 0
         self._comers = Comers(awaited)
-        self._hidden = False
-        """Whether somebody came whom the graph does not show yet."""
+        self._shown: set[Any] = set()
+        self._pending: dict[Any, float] = {}
+        """Whom the graph shows, and who does not listen yet, as far as is known; since when [s]."""
+        self._is_one_coming = self._hidden = False
+        """The second: one came in another's place, whom the graph does not show yet."""
         self._doubted_at: float | None = None
         """Since when it is not known whether somebody who came is to hear a first word [s]."""
 
     @property
     def holds(self) -> bool:
         """Whether somebody came of whom it is not known yet whether he is to hear a first word."""
-        return self._doubted_at is not None
+        return self._doubted_at is not None or self._is_one_coming
 
     def look(self, listeners: int, came: int | None, now: float, nodes: Nodes) -> bool:
         """See who listens.
@@ -56,24 +62,18 @@ class Hearing:
             listeners: How many do.
             came: How often anybody began to, since there is this publisher; None: this middleware does not tell.
             now: Seconds.
-            nodes: Asked where they may be others.
+            nodes: Whom the graph shows: it may be before he listens, or after.
 
         Returns:
             Whether somebody left, or came who is to hear a first word.
         """
         before, self._listeners = self._listeners, listeners
         came_before, self._came = self._came, came
-        quiet = listeners == before and came is not None and came == came_before
-        if quiet and not self._comers.unnamed and not self._hidden:
-            return False
-        back = self._comers.is_anybody_back(nodes())
         new = came - came_before if came is not None and came_before is not None else 0
-        if self._comers.changed:
-            self._hidden = False
-        elif new > 0:
-            self._hidden = True
-            back |= new > listeners - before  # one in another's place
-        if not self._comers.doubtful and not self._hidden:
+        here = self._connected(nodes, listeners, now, told=came is None or new > 0)
+        back = self._comers.is_anybody_back(here)
+        self._hidden = not self._comers.changed and (self._hidden or new > max(0, listeners - before))
+        if not self._comers.doubtful and not self._hidden and listeners <= len(here):
             self._doubted_at = None
         elif self._doubted_at is None:
             self._doubted_at = now
@@ -85,12 +85,24 @@ class Hearing:
             self._settle()
         elif back or (listeners > before and self.unread_s > SILENT_S):
             # The wheels' node may have been started again, beside somebody else.
-            self.heard, self._told_since = False, now
+            self.heard, self._told_since = False, None
             self.renewed += 1
             self._settle()
         else:
             return listeners < before
         return True
+
+    def _connected(self, nodes: Nodes, listeners: int, now: float, *, told: bool) -> Nodes:
+        """Those of the graph's who listen: DDS shows somebody, connects him, and then tells that it did.
+
+        One whom it never connects, as he asks for more than is offered, stays pending.
+        """
+        self._pending |= dict.fromkeys(nodes.keys() - self._shown, now)
+        self._shown = set(nodes)
+        pending = {key: at for key, at in self._pending.items() if key in nodes}
+        self._pending = {} if told or listeners > len(nodes) - len(pending) else pending
+        self._is_one_coming = any(now - at < COMES_S for at in self._pending.values())
+        return {key: name for key, name in nodes.items() if key not in self._pending}
 
     def update(self, listeners: int, came: int | None, read: bool, now: float, nodes: Nodes) -> None:
         """A message is about to be published.

@@ -25,9 +25,9 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import get_rmw_implementation_identifier
 
 try:
-    from rclpy.event_handler import SubscriptionEventCallbacks
+    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 except ImportError:  # Humble
-    from rclpy.qos_event import SubscriptionEventCallbacks
+    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
 
 from . import definitions, graph, types
 from .frames import (
@@ -246,9 +246,21 @@ class Program:
         self._names[channel] = name
         self._sender.set(channel, FIRST, 1)
         qos = graph.profile(reliable, transient_local, depth, lifespan_s)
-        publisher = self._publishers[channel] = self._node.create_publisher(types.load(kind), name, qos)
+        cls, came = types.load(kind), [0]
+        try:  # an event that nobody takes would have the executor wait no more
+            events = PublisherEventCallbacks(matched=lambda event: came.__setitem__(0, event.total_count))
+            publisher = self._node.create_publisher(cls, name, qos, event_callbacks=events)
+        except Exception:  # Humble, or this middleware, does not tell
+            publisher, came = self._node.create_publisher(cls, name, qos), []
+        self._publishers[channel] = publisher
         self._fresh[channel] = FreshPublisher(
-            self._node, publisher, inf if lifespan_s is None else lifespan_s, awaited, self._speaking, _now
+            self._node,
+            publisher,
+            inf if lifespan_s is None else lifespan_s,
+            lambda: came[0] if came else None,
+            awaited,
+            self._speaking,
+            _now,
         )
         if farewell:
             self._farewells[channel] = base64.b64decode(farewell), farewell_after_s
