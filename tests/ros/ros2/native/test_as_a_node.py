@@ -278,21 +278,22 @@ threading.Thread(target=work, daemon=True).start()
 
 
 class Drives:
-    """Drives at 0.5 m/s, and tells who comes to stand first, as guard and gate do."""
+    """Drives at 0.5 m/s, and tells who comes to stand first and how that begins, as guard and gate do."""
 
     def __init__(self, node, awaited=()):
         endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(reliable=True))
         self.wheels = node.publish(endpoint, fresh_s=0.1, awaited=awaited)
-        self._stand, self._forward = encode(Twist()), encode(Twist(linear=Vector3(x=0.5)))
+        self._speed = 0.0
         self._seen = None
 
     def turn(self):
         time.sleep(0.02)
         if self.wheels.renewed != self._seen or not self.wheels.heard or self.wheels.unread_s > 0.1:
-            self._seen = self.wheels.renewed
-            self.wheels.put(self._stand, first=True)
+            self._seen, self._speed = self.wheels.renewed, 0.0
         else:
-            self.wheels.put(self._forward, renewed=self._seen)
+            self._speed = min(self._speed + 0.02, 0.5)
+        twist = encode(Twist(linear=Vector3(x=self._speed)))
+        self.wheels.put(twist, renewed=self._seen, first=not self._speed)
 
 
 @pytest.mark.parametrize("awaited", [(), ("/base",)], ids=["anybody", "named"])
@@ -307,8 +308,9 @@ def test_a_subscription_that_is_made_anew_at_once_hears_a_standstill_first(ros2_
     for number, x in (said for said in base.heard if said != "done"):
         first.setdefault(number, x)
     assert len(first) >= 8
-    assert set(first.values()) == {0.0}, [said for said in base.heard if said != "done" and first[said[0]]][:40]
-    assert [8, 0.5] in base.heard
+    # Whoever acknowledges what he never got, as he joins late, hears the first steps.
+    assert max(first.values()) <= 0.1, first
+    assert max(x for number, x in (said for said in base.heard if said != "done") if number) >= 0.3
 
 
 @pytest.mark.parametrize("awaited", [(), ("/base",)], ids=["anybody", "named"])
@@ -325,7 +327,7 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
             until(lambda base=base: drives.turn() or base.heard.extend(base.all()) or 0.5 in base.heard, "a velocity")
             after = ros2_nodes.start(listens, name="base")
             until(lambda after=after: drives.turn() or after.heard.extend(after.all()) or 0.5 in after.heard, "one")
-            assert after.heard[0] == 0.0
+            assert after.heard[0] <= 0.1
             base.process.send_signal(signal.SIGINT)
             base.process.wait(10)
             base = after
