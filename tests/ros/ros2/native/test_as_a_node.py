@@ -281,7 +281,9 @@ class Drives:
     """Drives at 0.5 m/s, and tells who comes to stand first and how that begins, as guard and gate do."""
 
     def __init__(self, node, awaited=()):
-        endpoint = Endpoint(Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(reliable=True))
+        endpoint = Endpoint(
+            Kind.PUBLISHER, "/cmd_vel", Twist.TYPE, hash_of(Twist.TYPE, "cdr"), Qos(reliable=True, depth=1)
+        )
         self.wheels = node.publish(endpoint, fresh_s=0.1, awaited=awaited)
         self._speed = 0.0
         self._seen = None
