@@ -257,6 +257,8 @@ async def ask_long(
             start = start or said.find(b"\r\n\r\n") + 4 * (b"\r\n\r\n" in said)
     finally:
         writer.transport.abort()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
     if not (found := _STATUS.match(said)) or start < len(b"\r\n\r\n"):
         raise ValueError("it ended before it said whether it did it")
     lines = (line.partition(":") for line in said[:start].decode("latin-1").split("\r\n")[1:])
