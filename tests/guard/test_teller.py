@@ -151,13 +151,13 @@ def test_who_begins_at_a_standstill_goes_on_before_it_is_known_that_anything_lef
     first.wheels.held = Sent(-inf, -inf)
     assert first.turn(2.0, FAST)
     assert first.wheels.told == [STANDSTILL]
-    for i in range(1, 5):
+    for i in range(1, 6):
         assert first.turn(2.0 + i * PERIOD, FAST)
     assert first.wheels.told[-1].linear > 0
-    assert first.wheels.untils[-1] == pytest.approx(2.0 + PATIENCE)
-    first.wheels.held = Sent(2.08, 2.08)
-    assert first.turn(2.1, FAST)
-    assert first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
+    assert first.wheels.untils[-1] == pytest.approx(2.02 + PATIENCE)
+    first.wheels.held = Sent(2.1, 2.1)
+    assert first.turn(2.12, FAST)
+    assert first.wheels.untils[-1] == pytest.approx(2.12 + FRESH * PERIOD)
 
 
 def test_wheels_that_are_not_known_to_hear_are_told_to_stand_until_they_are(both):
@@ -171,6 +171,15 @@ def test_wheels_that_are_not_known_to_hear_are_told_to_stand_until_they_are(both
     first.wheels.held = Sent(2.18, 2.18)
     assert first.turn(2.2, FAST)
     assert first.wheels.told[-1].linear == pytest.approx(1.0 * PERIOD)
+
+
+def test_standing_wheels_are_told_so_whether_they_acknowledge_it_or_not(both):
+    """Or who tells them would fall silent each tenth of a second, and the other one take over."""
+    first, _ = both
+    first.wheels.held = Sent(2.0, 2.0)
+    first.wheels.silent = "hangs"
+    assert all(first.turn(2.0 + i * PERIOD, FAST) for i in range(30))
+    assert set(first.wheels.told) == {STANDSTILL}
 
 
 def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):

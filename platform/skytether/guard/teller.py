@@ -34,7 +34,7 @@ from typing import NamedTuple, Protocol
 
 from .board import Board, Entry, Role
 from .protocol import LastCommand
-from .velocity import Velocity
+from .velocity import STANDSTILL, Velocity
 from .watch import Watch
 
 SILENT = 1.5
@@ -208,7 +208,7 @@ class Teller:
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
             pid = self._board.place(other).end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
-        at, goes_on = self._clock(), self._watch.goes_on(now)
+        at, goes_on = self._clock(), self._watch.goes_on(now) and self._watch.told.velocity != STANDSTILL
         until = at + FRESH * self._period_s  # from this look on: this process may stand still at any moment
         if goes_on:
             until = min(until, self._heard_at + self._watch.patience_s)
