@@ -952,6 +952,14 @@ class Site:
             while not any(line.startswith(begins) for line in self.engine.lines):
                 await asyncio.sleep(0.01)
 
+    async def begin(self, container: str) -> asyncio.Task[None]:
+        """Start one, which the engine does not say before it is let."""
+        line = f"POST /v1.41/containers/{container}/start"
+        self.engine.slow[line] = threading.Event()
+        starts = asyncio.create_task(self.start(container))
+        await self.soon(line)
+        return starts
+
     async def slowly(self, line: str) -> asyncio.Task[bytes]:
         """Ask something that the engine does not answer before it is let."""
         self.engine.slow[line] = threading.Event()
@@ -1148,9 +1156,7 @@ def test_whose_network_is_joined_is_paused_meanwhile_and_not_ended(
         site = Site(engine)
         await site.start(X)
         starts, ends = f"POST /v1.41/containers/{Y}/start", f"POST /v1.41/containers/{X}/kill?signal=KILL"
-        engine.slow[starts] = threading.Event()
-        way = asyncio.create_task(site.start(Y))
-        await site.soon(starts)
+        way = await site.begin(Y)
         for ending in (ends, f"DELETE /v1.41/containers/{X}?force=1", f"DELETE /v1.41/containers/{X}?v=1&force=1"):
             assert b"another container is just joining its network" in await site.ask(ending)
         other = asyncio.create_task(site.start(Z))
@@ -1188,9 +1194,7 @@ def test_who_ends_a_container_goes_before_those_that_wait_to_join_its_network(en
         site = Site(engine)
         await site.start(X)
         starts, ends = f"POST /v1.41/containers/{Y}/start", f"POST /v1.41/containers/{X}/kill?signal=KILL"
-        engine.slow[starts] = threading.Event()
-        first = asyncio.create_task(site.start(Y))
-        await site.soon(starts)
+        first = await site.begin(Y)
         waits = asyncio.create_task(site.ask(f"POST /v1.41/containers/{Z}/start"))
         await asyncio.sleep(0.05)
         ending = asyncio.create_task(site.ask(ends))
@@ -1215,9 +1219,7 @@ def test_joins_of_one_network_that_wait_for_each_other_are_few(engine: Engine) -
         site = Site(engine)
         await site.start(X)
         starts = f"POST /v1.41/containers/{many[0]}/start"
-        engine.slow[starts] = threading.Event()
-        first = asyncio.create_task(site.start(many[0]))
-        await site.soon(starts)
+        first = await site.begin(many[0])
         rest = [asyncio.create_task(site.ask(f"POST /v1.41/containers/{one}/start")) for one in many[1:]]
         while sum(one.done() for one in rest) < len(rest) - 3:
             await asyncio.sleep(0.01)

@@ -338,18 +338,19 @@ class EngineGate:
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
             try:
-                described = await self._ask(f"/containers/{made}/json", patience=_END_S, most=_MOST_DESCRIBED + 1)
-                large = len(described.content) > _MOST_DESCRIBED
+                await self._must_be_brief(made)
             except RefusedCall:
-                large = True  # for all that is known
-            if large:
                 whole = f"/containers/{made}?force=1"
                 removes = partial(self._removals.remove_container, made, f"{whole}&v=1", whole)
                 await self._tried(self._removals.end(made, removes))  # it may run by now
-                raise RefusedCall(
-                    f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says"
-                )
+                raise
         return answer.status, answer.content, JSON
+
+    async def _must_be_brief(self, container: str) -> None:
+        """Raises if what the engine says of it is large, or cannot be known."""
+        described = await self._ask(f"/containers/{container}/json", patience=_END_S, most=_MOST_DESCRIBED + 1)
+        if len(described.content) > _MOST_DESCRIBED:
+            raise RefusedCall(f"its description has more than {_MOST_DESCRIBED >> 10} KiB, with what its image says")
 
     async def _make(self, target: str, said: Any) -> tuple[int, bytes, str]:
         """A network, unless there are many of ours."""
