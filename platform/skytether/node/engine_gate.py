@@ -334,7 +334,7 @@ class EngineGate:
         if self._creates.locked():
             raise RefusedCall("too many containers are being made", HTTPStatus.SERVICE_UNAVAILABLE)
         async with self._creates:  # however long it takes
-            answer = await self._tried(ask_long(self._engine, target, method="POST", text=text))
+            answer = await self._tried(ask_long(self._engine, target, method="POST", body=text))
         if answer.status == HTTPStatus.CREATED:
             made = json.loads(answer.content)["Id"]
             try:

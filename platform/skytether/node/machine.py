@@ -220,9 +220,7 @@ async def ask_long(
     what: str,
     *,
     method: str,
-    archive: bytes = b"",
     body: Any = None,
-    text: bytes = b"",
     headers: Mapping[str, str] | None = None,
     most: int = _MOST,
 ) -> Answer:
@@ -232,9 +230,7 @@ async def ask_long(
         path: Of the engine's socket.
         what: Path and query.
         method: As HTTP names it.
-        archive: Sent, unless it is empty.
-        body: Sent as JSON in its place, unless it is None.
-        text: The same, as JSON already.
+        body: Sent as JSON, unless it is None; bytes as they are.
         headers: More of them.
         most: Bytes of the answer, which is cut off there.
 
@@ -245,8 +241,8 @@ async def ask_long(
     reader, writer = await asyncio.open_unix_connection(sock=await _connect(path))
     try:
         # By this version an engine says no more than one answer, in one piece.
-        content = archive or text if body is None else json.dumps(body).encode()
-        kind = "application/x-tar" if archive else "application/json"
+        content = body if isinstance(body, bytes) else b"" if body is None else json.dumps(body).encode()
+        kind = "application/x-tar" if method == "PUT" else "application/json"
         given = {"Host": "engine", **({"Content-Type": kind} if content else {}), **(headers or {})}
         rows = "".join(f"{key}: {value}\r\n" for key, value in given.items())
         asked = f"{method} {what} HTTP/1.0\r\n{rows}Content-Length: {len(content)}\r\n\r\n"

@@ -199,7 +199,7 @@ class Removals:
         if container in self._mine or not takes:
             return None
         self._puts[container] += 1
-        task = begun(ask_long(self._engine, path, method="PUT", archive=archive))
+        task = begun(ask_long(self._engine, path, method="PUT", body=archive))
         task.add_done_callback(lambda _: self._has_put(container))
         return await asyncio.shield(task)  # the engine goes on with it, whoever waits for it: no start overtakes it
 
