@@ -202,22 +202,22 @@ class Publication(Handle):
             return fresh(self.channel, number, until, renewed, body)
 
     def on_frame(self, frame: Frame) -> None:
-        number, unread_s, published, heard, renewed = pull_dealt_with(frame.body)
+        done = pull_dealt_with(frame.body)
         with self._lock:
-            self._heard, self.renewed = heard, renewed
-            self._unread = (_now(), unread_s)
-            over = []
-            while self._waiting and self._waiting[0][0] <= number:
-                over.append(self._waiting.popleft()[1])
-            new, self._published = published - self._published, published
-            if over and not unread_s:  # before this one
+            self._heard, self.renewed = done.heard, done.renewed
+            self._unread = (_now(), done.unread_s)
+            new, self._published = done.published - self._published, done.published
+            over = 0
+            if self._waiting and self._waiting[0][0] <= done.number and not done.unread_s:  # before this one
                 self.heard_at = self.left_at
-            if over:
-                self.lost = new <= 0
-            if new > 0 and over:
-                self.left_at = over[min(new, len(over)) - 1]
+            while self._waiting and self._waiting[0][0] <= done.number:
+                number, at = self._waiting.popleft()
+                over += 1
+                self.lost = number > done.newest
+                if number == done.newest:
+                    self.left_at = at
             self.passed += new
-            self.dropped += len(over) - new  # too old, or a newer one came before their turn
+            self.dropped += over - new  # too old, or a newer one came before their turn
 
     def begin(self) -> None:
         self._begun = True

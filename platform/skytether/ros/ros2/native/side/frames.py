@@ -9,9 +9,8 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, int64 for whom, serialised message, which is
   published until then or never, and to nobody who came later: for whom is how often somebody had come who is to hear a
-  first word, or `FOR_ALL` or `FIRST_WORD`; from the node the number, float64 seconds for which nobody has acknowledged
-  what was published, uint64 how many of this topic were published so far, a bool, whether they are heard, and int64 how
-  often somebody came: this message, and those before it, wait no more. A velocity of a subscription comes from the node
+  first word, or `FOR_ALL` or `FIRST_WORD`; from the node what `DealtWith` has, in this order:
+  that message, and those before it, wait no more. A velocity of a subscription comes from the node
   as others go to it, and is taken until then or never.
 """
 
@@ -27,7 +26,7 @@ NUMBER = struct.Struct("<Q")
 FOR_ALL, FIRST_WORD = -1, -2
 """Messages that go to whoever listens; the second is good as the first that somebody hears."""
 FRESH = struct.Struct("<Qdq")
-_DEALT_WITH = struct.Struct("<QdQ?q")
+_DEALT_WITH = struct.Struct("<QQQd?q")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
@@ -51,6 +50,23 @@ class Frame(NamedTuple):
     kind: Kind
     channel: int
     body: bytes
+
+
+class DealtWith(NamedTuple):
+    """How far a node has come with the messages of `fresh` of a topic."""
+
+    number: int
+    """Of the last that it is done with, and with all before it."""
+    newest: int
+    """Of the last of those that was published; 0: none was."""
+    published: int
+    """How many were."""
+    unread_s: float
+    """For how long all before are not acknowledged [s]."""
+    heard: bool
+    """Whether somebody listens, and everybody who does is known to hear, or has had the time to begin."""
+    renewed: int
+    """How often somebody began to listen who is to hear a first word."""
 
 
 class Readable(Protocol):
@@ -98,24 +114,14 @@ def pull_fresh(body: bytes) -> tuple[int, float, int, bytes]:
     return *FRESH.unpack_from(body), body[FRESH.size :]
 
 
-def dealt_with(channel: int, number: int, unread_s: float, published: int, heard: bool, renewed: int) -> Frame:
-    """A frame of the node: it is done with a message of `fresh`, and all before it.
-
-    Args:
-        channel: The topic's.
-        number: Of the message.
-        unread_s: For how long all before it are unread [s].
-        published: How many of this topic were, so far.
-        heard: Whether somebody listens, and everybody who does is known to hear, or has had the time to begin.
-        renewed: How often somebody began to listen who is to hear a first word.
-    """
-    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(number, unread_s, published, heard, renewed))
+def dealt_with(channel: int, done: DealtWith) -> Frame:
+    """A frame of the node."""
+    return Frame(Kind.FRESH, channel, _DEALT_WITH.pack(*done))
 
 
-def pull_dealt_with(body: bytes) -> tuple[int, float, int, bool, int]:
-    """All but the channel of `dealt_with`."""
-    number, unread_s, published, heard, renewed = _DEALT_WITH.unpack(body)
-    return number, unread_s, published, heard, renewed
+def pull_dealt_with(body: bytes) -> DealtWith:
+    """What `dealt_with` has."""
+    return DealtWith(*_DEALT_WITH.unpack(body))
 
 
 def pull_number(body: bytes) -> tuple[int, bytes]:

@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.duration import Duration
 
 from . import graph
-from .frames import FIRST_WORD, FOR_ALL, Frame, dealt_with
+from .frames import FIRST_WORD, FOR_ALL, DealtWith, Frame, dealt_with
 from .hearing import Hearing
 
 FAREWELL_S = 0.3
@@ -59,7 +59,7 @@ class FreshPublisher:
         self._nodes = partial(graph.listeners, node, publisher.topic_name)
         self._came = came
         self._published, self._published_at = 0, now()
-        self._number = 0
+        self._number = self._newest = 0
         self._read = True
 
     def publish(self, number: int, until: float, renewed: int, body: bytes) -> None:
@@ -77,7 +77,8 @@ class FreshPublisher:
         finally:
             with self._lock:
                 self._number = number
-                self._published += published
+                if published:
+                    self._published, self._newest = self._published + 1, number
 
     def _publish(self, until: float, renewed: int, body: bytes) -> bool:
         hearing, publisher, now = self._hearing, self._publisher, self._now()
@@ -113,7 +114,8 @@ class FreshPublisher:
         """What the agent is told of what was dealt with."""
         hearing = self._hearing
         with self._lock:
-            return dealt_with(channel, self._number, hearing.unread_s, self._published, hearing.heard, hearing.renewed)
+            told = hearing.unread_s, hearing.heard, hearing.renewed
+            return dealt_with(channel, DealtWith(self._number, self._newest, self._published, *told))
 
     def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
         """Publish a last word until it is acknowledged.
