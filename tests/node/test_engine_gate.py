@@ -39,7 +39,7 @@ CREATED = b"""{"Image": "a", "Labels": {"skytether.io/owner": "edge"}, "HostConf
 WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
     b'"CapDrop"',
     b'"Mounts": [{"Type": "volume", "Source": "skytether-main_state", "Target": "/d", '
-    b'"VolumeOptions": {"NoCopy": true}}], "CapDrop"',
+    b'"VolumeOptions": {"NoCopy": true, "Labels": {"skytether.io/owner": "edge"}}}], "CapDrop"',
 )
 
 OWN_VOLUME = {"Name": "a" * 64, "Destination": "/run/skytether"}
@@ -774,6 +774,30 @@ def test_all_is_weighed_however_much_an_engine_has_to_tell(engine: Engine) -> No
     told = json.loads(got.partition(b"\r\n\r\n")[2])["Volumes"]
     assert told[79] == {"Name": "v79", "Labels": {"skytether.io/owner": "edge"}, "UsageData": {"Size": 79}}
     assert len(told) == 80
+
+
+def test_who_takes_no_answer_of_how_large_all_is_keeps_nobody_else_from_it(engine: Engine) -> None:
+    engine.volumes = [{"Name": "v", "Labels": {"skytether.io/owner": "edge"}, "UsageData": {"Size": 7}}]
+
+    async def ask(passes: Any, drain: Any = None, version: str = "v1.41") -> bytes:
+        reader, back = asyncio.StreamReader(), AsyncMock(asyncio.StreamWriter, write=Mock())
+        back.drain = drain or back.drain
+        reader.feed_data(request(f"GET /{version}/system/df"))
+        reader.feed_eof()
+        await passes((reader, back), (reader, back))
+        return b"".join(call.args[0] for call in back.write.call_args_list)
+
+    async def run() -> None:
+        gate, takes = EngineGate(engine.path), asyncio.Event()
+        stubborn = gate.of_link()
+        ways = [asyncio.create_task(ask(stubborn, takes.wait, "v1.999")) for _ in range(12)]
+        for _ in range(3):
+            assert b'"Size": 7' in await asyncio.wait_for(ask(gate.of_link()), 5)
+        takes.set()
+        assert all(b'"Size": 7' in told for told in await asyncio.gather(*ways))
+
+    asyncio.run(run())
+    assert {line for line in engine.lines if "df" in line} == {"GET /system/df?type=volume&verbose=1"}
 
 
 def test_no_container_is_made_of_which_an_engine_has_much_to_tell(engine: Engine) -> None:

@@ -234,6 +234,8 @@ HOST: dict[str, Any] = {
             {"Mounts": [{"Type": "volume", "Target": "/d", "VolumeOptions": {"DriverConfig": {"Options": {}}}}]},
             "a volume has 'DriverConfig'",
         ),
+        ({"Mounts": [named(NoCopy=True)]}, "a volume without the label skytether.io/owner"),
+        ({"Mounts": [{"Type": "volume", "Target": "/d"}]}, "a volume without the label skytether.io/owner"),
         ({"Mounts": [named()]}, "it copies files of its image"),
         ({"Mounts": [named(NoCopy=False)]}, "it copies files of its image"),
         ({"Mounts": [named(nocopy=True)]}, "it copies files of its image"),
@@ -382,7 +384,7 @@ def test_a_container_is_published_at_a_plain_address(address: str) -> None:
 
 
 def test_of_containers_networks_and_volumes_it_has_to_be_looked_whose_they_are() -> None:
-    mounts = [named(NoCopy=True)]
+    mounts = [named(NoCopy=True, Labels=OWNER)]
     held = {**HOST, "NetworkMode": f"container:{ID}", "CapAdd": ["NET_ADMIN"], "Mounts": mounts}
     held["SecurityOpt"] = SECURITY
     made = {"Image": "a", "Labels": OWNER, "HostConfig": held}

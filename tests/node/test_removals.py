@@ -43,8 +43,10 @@ class Gated:
 
     def make(self, *shared: str, network: str = "") -> tuple[str, str]:
         """A container that runs, and the volume that it alone has."""
-        mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": {"Labels": self.labels}}] + [
-            {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {"NoCopy": True}} for one in shared
+        own = {"Labels": self.labels}
+        mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": own}] + [
+            {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {**own, "NoCopy": True}}
+            for one in shared
         ]
         body = {
             "Image": "debian:bookworm-slim",

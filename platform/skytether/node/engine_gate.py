@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from urllib.parse import parse_qsl, unquote, urlencode
 
 from skytether.api.printable import printable
-from skytether.api.splice import Stream
+from skytether.api.splice import PIECE, Stream
 
 from .archives import cleaned
 from .asking import JSON, Asking, RefusedCall
@@ -87,9 +87,20 @@ _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0
 """What an engine may take to say how large all is that it has [s]."""
-_MOST_WEIGHS, _TAKEN_S = 8, 10.0
-"""Ways that are told that at a time, and for how long each may take to take it [s]."""
+_MOST_WEIGHS, _TAKEN_S = 2, 10.0
+"""Ways of each orchestrator that are told that at a time, and for how long each may take to take it [s]."""
+_WEIGH = f"{WEIGHED}?type=volume&verbose=1"
+"""As newer engines are asked it; an earlier one tells all."""
 _WEIGHED, _OWNED, _SIZE = ("Volumes.item", "VolumeUsage.Items.item"), f"Labels.{OWNER}", "UsageData.Size"
+
+
+class Places:
+    """What one link may have of what takes memory."""
+
+    def __init__(self) -> None:
+        self.large = asyncio.Semaphore(_MOST_LARGE)
+        """For bodies."""
+        self.weighs = asyncio.Semaphore(_MOST_WEIGHS)
 
 
 class EngineGate:
@@ -117,8 +128,6 @@ class EngineGate:
         self._told: set[str] = set()
         self._told_at = -_TOLD_S
         self._weighing: asyncio.Task[bytes] | None = None
-        self._weighs = 0
-        """Ways that wait for that, or have it and have not taken it yet."""
         self._making = asyncio.Lock()
         self._creates = asyncio.Semaphore(_MOST_CREATES)
         asking = Asking(engine)
@@ -128,15 +137,15 @@ class EngineGate:
         self._pulls = Pulls(asking, Registries(registries), names, keep)
 
     def of_link(self) -> Callable[[Stream, Stream], Coroutine[Any, Any, None]]:
-        """What passes requests on that come by one link: large bodies of one wait for no other's."""
-        return partial(self.pass_requests, large=asyncio.Semaphore(_MOST_LARGE))
+        """What passes requests on that come by one link: what is large of one waits for no other's."""
+        return partial(self.pass_requests, places=Places())
 
-    async def pass_requests(self, asks: Stream, engine: Stream, large: asyncio.Semaphore) -> None:
-        """Until the one who asks has ended, or was refused something; ``large``: see `of_link`."""
+    async def pass_requests(self, asks: Stream, engine: Stream, places: Places) -> None:
+        """Until the one who asks has ended, or was refused something; ``places``: its link's."""
         (reader, back), (_, writer) = asks, engine
         try:
             while True:
-                await self._pass_one(reader, back, writer, large)
+                await self._pass_one(reader, back, writer, places)
         except asyncio.IncompleteReadError:
             return  # it has ended
         except (RefusedCall, asyncio.LimitOverrunError) as error:
@@ -162,7 +171,7 @@ class EngineGate:
         reader: asyncio.StreamReader,
         back: asyncio.StreamWriter,
         writer: asyncio.StreamWriter,
-        large: asyncio.Semaphore,
+        places: Places,
     ) -> None:
         head = await reader.readuntil(b"\r\n\r\n")
         first, *rows = head[:-4].split(b"\r\n")
@@ -177,7 +186,7 @@ class EngineGate:
         most = _MOST_ARCHIVE if archive else _MOST_JSON if plain(path) == _MAKES[0] else _LARGE
         if len(query) != len(pairs) or not length.isdigit() or len(length) > _MOST_DIGITS or int(length) > most:
             raise RefusedCall("its query or its length is odd")
-        async with large if int(length) > _LARGE else contextlib.nullcontext():
+        async with places.large if int(length) > _LARGE else contextlib.nullcontext():
             # All of it, an archive too: an engine that waits for the rest of one lets nobody end that container.
             async with asyncio.timeout(_BODY_S):
                 body = await reader.readexactly(int(length))
@@ -197,7 +206,8 @@ class EngineGate:
             path = await self._pulls.path_of(path)
             target = path + (f"?{urlencode(query)}" if query else "")
             if plain(call.path) == WEIGHED:
-                await self._weigh(target, back)
+                async with places.weighs:
+                    await self._weigh(back)
                 return
             if answered := self._answered(call, path, target, body if archive else b""):
                 await _answer(back, *await answered)
@@ -368,24 +378,18 @@ class EngineGate:
             found = {key: value for key, value in found.items() if key not in ("Containers", "Peers", "Services")}
         return status, json.dumps(found).encode(), JSON
 
-    async def _weigh(self, target: str, back: asyncio.StreamWriter) -> None:
-        """Tell of what there is what is ours. It may be much: few have that at a time, of one look at it."""
-        if self._weighs >= _MOST_WEIGHS:
-            raise RefusedCall("too many ask how large all is", HTTPStatus.SERVICE_UNAVAILABLE)
-        self._weighs += 1
-        try:
-            if self._weighing is None or self._weighing.done():
-                self._weighing = begun(self._tried(self._weigh_all(target)))
-            async with asyncio.timeout(_WEIGH_S):
-                told = await asyncio.shield(self._weighing)
-            async with asyncio.timeout(_TAKEN_S):
-                await _answer(back, HTTPStatus.OK, told, JSON)
-        finally:
-            self._weighs -= 1
+    async def _weigh(self, back: asyncio.StreamWriter) -> None:
+        """Tell of what there is what is ours. It may be much: there is one look at a time, for all who ask."""
+        if self._weighing is None or self._weighing.done():
+            self._weighing = begun(self._tried(self._weigh_all()))
+        async with asyncio.timeout(_WEIGH_S):
+            told = await asyncio.shield(self._weighing)
+        async with asyncio.timeout(_TAKEN_S):
+            await _answer(back, HTTPStatus.OK, told, JSON)
 
-    async def _weigh_all(self, target: str) -> bytes:
+    async def _weigh_all(self) -> bytes:
         keys = ("Name", _OWNED, _SIZE)
-        there = await asyncio.to_thread(listed, self._engine, target, _WEIGHED, keys, patience=_WEIGH_S)
+        there = await asyncio.to_thread(listed, self._engine, _WEIGH, _WEIGHED, keys, patience=_WEIGH_S)
         there.reverse()
         said = bytearray()
         while there:  # let go of one by one, for it may be much
@@ -438,8 +442,10 @@ def _may_be_published(inspected: Any) -> None:
 async def _answer(back: asyncio.StreamWriter, status: int, body: bytes, rows: str) -> None:
     """``rows``: more of its head."""
     head = f"HTTP/1.1 {int(status)} {HTTPStatus(status).phrase}\r\nContent-Length: {len(body)}\r\n{rows}\r\n\r\n"
-    back.write(head.encode() + body)
-    await back.drain()
+    back.write(head.encode())
+    for start in range(0, len(body), PIECE):  # a connection keeps what it does not take
+        back.write(body[start : start + PIECE])
+        await back.drain()
 
 
 def _header(row: bytes) -> tuple[bytes, bytes]:

@@ -359,9 +359,12 @@ def _mount(mount: Any) -> str | None:
         return "it copies files of its image into a volume that others may have"
     if odd := _labels(options):
         return f"it has a volume with {odd}"
-    return _only(options, {"Labels", "NoCopy"}, "a volume") or _only(
+    refused = _only(options, {"Labels", "NoCopy"}, "a volume") or _only(
         mount, {"Type", "Source", "Target", "VolumeOptions"}, "a mount"
     )
+    # One that is not there an engine makes: without that, nobody could have or remove it any more.
+    unowned = None if OWNER in _at(options, "Labels") else f"it has a volume without the label {OWNER}"
+    return refused or unowned
 
 
 def _device(device: Any, devices: set[str]) -> str | None:

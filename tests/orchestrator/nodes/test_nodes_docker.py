@@ -191,7 +191,8 @@ def gets_nothing_by_a_way_around(client: Engine, good: dict[str, Any], docker_si
     linked = imported.stdout.decode().strip()
     try:
         for of, inner, good_way in ((image, "/outer/a/b", False), (linked, "/alias/a/b", False), (linked, "/b", True)):
-            mounts = [{"Type": "volume", "Target": path} for path in ("/outer", inner)]
+            options = {"Labels": good["Labels"]}
+            mounts = [{"Type": "volume", "Target": path, "VolumeOptions": options} for path in ("/outer", inner)]
             body = {**good, "Image": of, "HostConfig": {**good["HostConfig"], "Mounts": mounts}}
             made = client.create_container_from_config(body)["Id"]
             try:
