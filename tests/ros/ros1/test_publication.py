@@ -7,6 +7,7 @@ import pytest
 
 from skytether.ros.ros1.publication import Publication
 from skytether.ros.ros1.tcpros import pack_frame, pack_header, read_frame, read_header
+from skytether.ros.ros2.native.side.comers import FINDS_S
 
 
 def run(work, **options):
@@ -100,7 +101,11 @@ def test_messages_are_held_for_a_first_subscriber_and_a_latched_one_for_all():
 
 
 def test_who_begins_to_listen_after_somebody_has_left_counts():
-    """Beside a recorder, say, the wheels' node may have been started again; who only comes besides does not count."""
+    """Beside a recorder, say, the wheels' node may have been started again; who only comes besides does not count.
+
+    Nor does anybody know who was told something by one that was killed, and in whose place this one is.
+    """
+    now = 100.0
 
     async def work(publication, connect):
         async def listen(count, name):
@@ -109,10 +114,13 @@ def test_who_begins_to_listen_after_somebody_has_left_counts():
             while len(publication.subscribers) != count:
                 await asyncio.sleep(0.001)
 
+        nonlocal now
         writers = []
         await listen(1, "/recorder")
         await listen(2, "/base")
-        assert publication.renewed == 0
+        assert publication.renewed == 2
+        now += FINDS_S
+        publication.renewed = 0
         writers[1].close()
         while len(publication.subscribers) != 1:
             await asyncio.sleep(0.001)
@@ -124,7 +132,7 @@ def test_who_begins_to_listen_after_somebody_has_left_counts():
         for writer in writers:
             writer.close()
 
-    run(work)
+    run(work, clock=lambda: now)
 
 
 def test_what_was_wanted_before_somebody_came_is_no_first_word_for_him():

@@ -13,7 +13,7 @@ from math import inf
 
 from skytether.guard.clock import now as boottime
 from skytether.ros.names import ros1_type
-from skytether.ros.ros2.native.side.comers import Comers
+from skytether.ros.ros2.native.side.comers import FINDS_S, Comers
 
 from .tcpros import ANY, pack_frame, pack_header, sums_differ
 
@@ -148,7 +148,7 @@ class Publication:
         self._handover: deque[tuple[_Frame, int | None]] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self.renewed = 0
-        self._comers = Comers(awaited)
+        self._comers, self._began = Comers(awaited), clock()
         self._refused: set[tuple[str, str]] = set()
 
     @property
@@ -214,7 +214,8 @@ class Publication:
             subscriber.close()
 
     def _is_anybody_back(self) -> bool:
-        return self._comers.is_anybody_back({each: each.caller for each in self._subscribers})
+        there = {each: each.caller for each in self._subscribers}
+        return self._comers.is_anybody_back(there, young=self._clock() - self._began < FINDS_S)
 
     def _refusal(self, caller: str, header: dict[str, str]) -> str:
         kind, md5 = header.get("type", ANY), header.get("md5sum", ANY)

@@ -47,6 +47,19 @@ def test_who_may_be_back(ways, back):
     assert [number for number, names in enumerate(ways) if comers.is_anybody_back(names)] == back
 
 
+def test_whoever_comes_while_it_is_young_may_be_back():
+    """It is in the place of one that was killed, and finds the wheels later than a recorder."""
+    comers = Comers()
+    comers.is_anybody_back({1: "/echo"}, young=True)
+    assert not comers.is_anybody_back({1: "/echo"}, young=True)
+    assert comers.is_anybody_back({1: "/echo", 2: "/base"}, young=True)
+    assert comers.is_anybody_back({1: "/echo", 2: "/base", 3: ""}, young=True)
+    assert not comers.doubtful
+    assert not comers.is_anybody_back({1: "/echo", 2: "/base", 3: "", 4: "/new"})
+    named = Comers(["/base"])
+    assert not named.is_anybody_back({1: "/echo"}, young=True)
+
+
 def test_who_comes_without_a_name_may_be_anybody_until_that_is_known():
     comers = Comers()
     comers.is_anybody_back({1: "/base"})

@@ -2,6 +2,7 @@
 
 import pytest
 
+from skytether.ros.ros2.native.side.comers import FINDS_S
 from skytether.ros.ros2.native.side.hearing import COMES_S, DOUBT_S, HEARS_S, SILENT_S, Hearing
 
 TICK = 0.02
@@ -80,6 +81,16 @@ def test_while_it_is_not_known_who_came_nothing_is_said_but_a_first_word(publish
     assert publisher.publish("be ", True).holds
     assert not publisher.publish("bee", True).holds
     assert publisher.hearing.renewed == renewed + 1, "one who was there, by another process"
+
+
+def test_whoever_is_found_soon_after_the_publisher_began_is_to_hear_a_first_word(publisher):
+    """One before it was killed, and this one finds the wheels later than a recorder."""
+    publisher.hearing = Hearing(began=publisher.now)
+    publisher.publish("e", True, 5)
+    before = publisher.hearing.renewed
+    assert publisher.publish("eb", True).renewed == before + 1
+    publisher.publish("eb", True, int(FINDS_S / TICK))
+    assert publisher.publish("ebn", True).renewed == before + 1
 
 
 def test_who_has_no_name_for_long_is_to_hear_a_first_word(publisher):

@@ -7,6 +7,8 @@ from typing import Any
 
 MOST = 256
 """Names of those who left that are known."""
+FINDS_S = 10.0
+"""After its start a publisher that is in another's place finds who was told something by that one."""
 
 
 class Comers:
@@ -37,7 +39,7 @@ class Comers:
         """Whoever is here may be back, and has been told so."""
         self._open.clear()
 
-    def is_anybody_back(self, listeners: Mapping[Any, str]) -> bool:
+    def is_anybody_back(self, listeners: Mapping[Any, str], *, young: bool = False) -> bool:
         """Whether somebody came who may have been there before, or is awaited.
 
         Whoever comes may be one who left by another name. A name that is there twice is of one who was killed, too, and
@@ -46,6 +48,7 @@ class Comers:
         Args:
             listeners: Names of all who listen now, each under what is its subscription's alone; empty where it is not
                 known: that is seen later.
+            young: Who comes may have been there before this one was, see `FINDS_S`.
         """
         before, self._here = self._here, dict(listeners)
         self.changed = before.keys() != listeners.keys()
@@ -57,7 +60,7 @@ class Comers:
             back = not names.isdisjoint(self._awaited)
         else:
             there = {name for key, name in before.items() if key not in came}
-            back = bool(new and self._away) or not names.isdisjoint(there)
+            back = bool(new and (young or self._away)) or not names.isdisjoint(there)
         self._open = set() if back else {key for key in new | self._open if listeners.get(key) == ""}
         for name in (*came.values(), *([""] if new else [])):
             self._away.pop(name, None)

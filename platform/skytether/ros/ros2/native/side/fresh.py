@@ -53,7 +53,7 @@ class FreshPublisher:
     ) -> None:
         self._node, self._publisher, self._lifespan_s = node, publisher, lifespan_s
         self._speaking, self._now = speaking, now
-        self._hearing = Hearing(awaited)
+        self._hearing = Hearing(awaited, now())
         self._lock = threading.Lock()
         """Of what is known of who hears, and was published."""
         self._nodes = partial(graph.listeners, node, publisher.topic_name)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from math import inf
 from typing import Any
 
-from .comers import Comers
+from .comers import FINDS_S, Comers
 
 Nodes = Mapping[Any, str]
 """Names of those who listen, empty where it is not known, each under what is its subscription's alone."""
@@ -24,6 +25,7 @@ class Hearing:
 
     Args:
         awaited: Names of the nodes that it is for; empty: any that listens.
+        began: Since when there is this publisher [s].
 
     Attributes:
         heard: Whether somebody listens, and is known to hear.
@@ -31,7 +33,8 @@ class Hearing:
         unread_s: For how long somebody who listens, and did, has not acknowledged what was published [s].
     """
 
-    def __init__(self, awaited: Collection[str] = ()) -> None:
+    def __init__(self, awaited: Collection[str] = (), began: float = -inf) -> None:
+        self._began = began
         self.heard = False
         self.renewed = 0
         self.unread_s = 0.0
@@ -71,7 +74,7 @@ class Hearing:
         came_before, self._came = self._came, came
         new = came - came_before if came is not None and came_before is not None else 0
         here = self._connected(nodes, listeners, now, told=came is None or new > 0)
-        back = self._comers.is_anybody_back(here)
+        back = self._comers.is_anybody_back(here, young=now - self._began < FINDS_S)
         self._hidden = not self._comers.changed and (self._hidden or new > max(0, listeners - before))
         if not self._comers.doubtful and not self._hidden and listeners <= len(here):
             self._doubted_at = None
