@@ -30,6 +30,7 @@ from skytether.api.splice import closed, splice
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
+from skytether.node.removals import Removals
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.docker.reports import unpacked
 
@@ -1044,6 +1045,22 @@ def test_volumes_go_with_a_container_that_has_no_kin_though_it_runs(engine: Engi
         await site.ask(f"DELETE /v1.41/containers/{Y}?force=1&v=True")
         assert site.removed == [f"containers/{X}?v=1&force=1", f"containers/{Y}?force=1&v=True"]
         assert site.gate._removals._kin.all() == {Z, "volume skytether-s"}  # noqa: SLF001 all others are forgotten
+
+    asyncio.run(run())
+
+
+def test_many_containers_that_no_engine_lets_go_of_hold_up_others_as_one_does(engine: Engine) -> None:
+    hang = [f"{number:064x}" for number in range(12)]
+    engine.slow = {f"GET /containers/{one}/json": threading.Event() for one in hang}
+
+    async def run() -> None:
+        running = asyncio.create_task(Removals(engine.path)._running(hang))  # noqa: SLF001 what all removals ask
+        async with asyncio.timeout(2.5):  # one is given up after 3 s
+            while not set(engine.slow) <= set(engine.lines):
+                await asyncio.sleep(0.01)
+        for one in engine.slow.values():
+            one.set()
+        assert await running == set()
 
     asyncio.run(run())
 

@@ -519,6 +519,9 @@ def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: 
     assert holds(profile(entry)) is good
 
 
+HANGS = ("KILL", "KILL_THREAD", "NOTIFY", "TRACE", "LOG", "NOTHING")
+
+
 @pytest.mark.parametrize(
     "entries",
     [
@@ -532,6 +535,8 @@ def test_a_seccomp_profile_lets_through_no_way_out(entry: dict[str, Any], good: 
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": 0}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_KILL_THREAD"}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_KILL"}],
+        *([NEEDED, {"names": ["close"], "action": f"SCMP_ACT_{word}"}] for word in HANGS),
+        *([NEEDED, {"names": ["getpid"], "action": f"SCMP_ACT_{word}"}] for word in HANGS),
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": 1 << 16}],
         [NEEDED, {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": "38"}],
     ],

@@ -41,6 +41,8 @@ _MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN = 512, 128, 4
 """Under way at a time, and in line for one network: an engine may take its time for each, and whoever asked may be gone
 meanwhile."""
 _MOST_MINE = 1 << 15
+_MOST_ASKED = 32
+"""Containers that are asked for at a time: of one that an engine just starts it says nothing for some seconds."""
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
@@ -346,14 +348,18 @@ class Removals:
 
     async def _running(self, things: Iterable[str]) -> set[str]:
         """Those of these containers that run, or may."""
-        found = set[str]()
-        async with self._looking:  # one at a time, or much that is kin would take all threads
-            for container in [one for one in things if not one.startswith(_VOLUME)]:
+        found, waiting = set[str](), iter([one for one in things if not one.startswith(_VOLUME)])
+
+        async def look() -> None:
+            for container in waiting:
                 noted = self._noted
                 if await self._may_run(container) or noted != self._noted:  # or it may have been started since
                     found.add(container)
                 elif container not in self._starts:
                     self._kin.leave(container)
+
+        async with self._looking:
+            await asyncio.gather(*(look() for _ in range(_MOST_ASKED)))
         return found
 
     async def _may_run(self, container: str) -> bool:

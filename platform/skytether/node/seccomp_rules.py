@@ -16,6 +16,8 @@ from .seccomp_calls import CALLS
 
 _REFUSES = {f"SCMP_ACT_{word}" for word in ("ERRNO", "KILL_PROCESS", "TRAP")}
 """None that ends one thread: runc has several, and the others wait for ever, and whoever started it."""
+_LETS = "SCMP_ACT_ALLOW"
+"""Others (``NOTIFY``, ``TRACE``) have a call wait for somebody who may not be there, or end a thread."""
 _NEW_NAMESPACES = 0x7E020000
 """Flags of ``clone``."""
 _FLAGS_SECOND = {"s390", "s390x"}
@@ -116,7 +118,11 @@ def _closed(entry: Mapping[str, Any]) -> bool:
         return False
     if includes.keys() - {"caps", "arches", "minKernel"} or not isinstance(includes.get("caps") or [], list):
         return False
-    if _refuses(entry.get("action")) or set(map(str, includes.get("caps") or [])) - _GUARDS:
+    if _refuses(entry.get("action")):
+        return True
+    if entry.get("action") != _LETS:
+        return False
+    if set(map(str, includes.get("caps") or [])) - _GUARDS:
         return True
     allowed = _named(entry)
     if not allowed <= CALLS:
