@@ -179,6 +179,7 @@ HOST: dict[str, Any] = {
     "CapDrop": ["ALL"],
     "SecurityOpt": SECURITY,
     "ReadonlyRootfs": True,
+    "Init": True,
     "PidsLimit": 64,
 }
 
@@ -196,6 +197,8 @@ HOST: dict[str, Any] = {
         ({"Runtime": "runc"}, "'Runtime'"),
         ({"DeviceCgroupRules": ["a *:* rwm"]}, "'DeviceCgroupRules'"),
         ({"MaskedPaths": []}, "'MaskedPaths'"),
+        ({"Init": False}, "its first process is not the engine's own"),
+        ({"Init": None}, "its first process is not the engine's own"),
         ({"NetworkMode": "host"}, "its network is 'host'"),
         ({"NetworkMode": "ns:/proc/1/ns/net"}, "its network is 'ns:"),
         ({"NetworkMode": "container:database"}, "its network is 'container:database'"),

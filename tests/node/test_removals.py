@@ -43,9 +43,9 @@ class Gated:
 
     def make(self, *shared: str, network: str = "") -> tuple[str, str]:
         """A container that runs, and the volume that it alone has."""
-        own = {"Labels": self.labels}
-        mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": own}] + [
-            {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {**own, "NoCopy": True}}
+        owned = {"Labels": self.labels}
+        mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": owned}] + [
+            {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {**owned, "NoCopy": True}}
             for one in shared
         ]
         body = {

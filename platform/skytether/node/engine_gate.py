@@ -83,6 +83,7 @@ take them all has addresses that the machine knows elsewhere."""
 _MOST_DESCRIBED = 64 << 10
 """Bytes of what an engine says of one container."""
 _MAKES, _PULL = ("/containers/create", "/volumes/create"), "/images/create"
+_LOOK_AGAIN_S = 5.0
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0
@@ -135,6 +136,14 @@ class EngineGate:
         self._files = Files(engine, asking)
         names, keep = (store.names(), store.save_names) if store else ({}, lambda _: None)
         self._pulls = Pulls(asking, Registries(registries), names, keep)
+
+    async def look_back(self) -> None:
+        """Once: have what an earlier program of the node left paused go on, as soon as the engine answers."""
+        while True:
+            try:
+                return await self._removals.look_back()
+            except (OSError, ValueError):
+                await asyncio.sleep(_LOOK_AGAIN_S)
 
     def of_link(self) -> Callable[[Stream, Stream], Coroutine[Any, Any, None]]:
         """What passes requests on that come by one link: what is large of one waits for no other's."""
@@ -250,7 +259,7 @@ class EngineGate:
         if call.method == "DELETE" and kind == "containers":
             rest = urlencode({key: value for key, value in call.query.items() if key != "v"})
             if "v" in call.query:
-                removes = partial(self._removals.remove_container, name, target, f"{way}?{rest}")
+                removes = partial(self._removals.remove_container, name, f"{way}?{rest}")
                 return self._kept(self._removals.end(name, removes))
             return self._kept(self._removals.end(name, partial(self._ask, target, method="DELETE", patience=_END_S)))
         if kind == "containers" and path.endswith(("/kill", "/update")):
@@ -350,8 +359,7 @@ class EngineGate:
             try:
                 await self._must_be_brief(made)
             except RefusedCall:
-                whole = f"/containers/{made}?force=1"
-                removes = partial(self._removals.remove_container, made, f"{whole}&v=1", whole)
+                removes = partial(self._removals.remove_container, made, f"/containers/{made}?force=1")
                 await self._tried(self._removals.end(made, removes))  # it may run by now
                 raise
         return answer.status, answer.content, JSON

@@ -263,6 +263,8 @@ def _container(body: Mapping[str, Any], devices: set[str]) -> str | None:
         _only(_at(host, "PortBindings"), {PORT}, "a container"),
         *(published(one) for bound in bindings for one in bound),
         None if all(len(bound) <= _MOST_PORTS for bound in bindings) else "it publishes too many ports",
+        # A process of its own as the first may end its first thread and go on: by no engine does it end any more.
+        None if host.get("Init") is True else "its first process is not the engine's own (Init)",
         None if host.get("ReadonlyRootfs") is True else "it may change its own files",
         None if type(pids) is int and 0 < pids <= _MOST_PIDS else f"its PidsLimit is {str(pids)[:80]}",
         None if host.get("CapDrop") == ["ALL"] else "it keeps rights of root",

@@ -50,7 +50,8 @@ class Files:
             return
         if status != HTTPStatus.OK or (refused := moved(found)):
             raise RefusedCall(f"its files are not looked at: {refused if status == HTTPStatus.OK else status}")
-        mounts = [str(one["Destination"]) for one in found.get("Mounts") or ()]
+        memory = (found.get("HostConfig") or {}).get("Tmpfs") or {}
+        mounts = {*(str(one["Destination"]) for one in found.get("Mounts") or ()), *map(str, memory)}
         try:
             odd = await self._images.odd(str(found["Image"]), ways(found), mounts)
         except (OSError, ValueError) as error:

@@ -14,12 +14,13 @@ import logging
 import re
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Container, Coroutine, Iterable, Mapping
 from http import HTTPStatus
 from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
+from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
@@ -210,22 +211,26 @@ class Removals:
         if not self._puts[container]:
             del self._puts[container]
 
-    async def remove_container(self, container: str, path: str, without: str) -> Answer:
-        """Have the engine remove one, with its volumes if nobody else can have a folder of these.
+    async def remove_container(self, container: str, path: str) -> Answer:
+        """Have the engine remove one, and then those of its volumes that nobody else can have a folder of.
 
         Args:
             container: Its id.
-            path: Path and query by which its volumes go, too.
-            without: Those by which they stay.
+            path: Path and query by which its volumes stay.
         """
         await self.look_back()
         answer = await ask_soon(self._engine, f"/containers/{container}/json")
         if answer.status != HTTPStatus.OK:
             return answer  # it is gone, or nobody knows its volumes
-        things = (container, *_volumes(lean(answer.content)))
+        volumes = _volumes(lean(answer.content))
         del answer  # it may be large, and the engine may take any time
-        removed = await self._removed(things, path, itself=container)
-        return removed or await ask_long(self._engine, without, method="DELETE")
+        removed = await ask_long(self._engine, path, method="DELETE")
+        if removed.status < HTTPStatus.BAD_REQUEST:
+            for volume in (one.removeprefix(_VOLUME) for one in volumes):
+                if _OWN.fullmatch(volume):
+                    with contextlib.suppress(BusyError):  # it has a label by which it is found again
+                        await self._removed((_VOLUME + volume,), f"/volumes/{volume}")
+        return removed
 
     async def remove_volume(self, volume: str, path: str) -> Answer:
         """Have the engine remove one; if somebody can have a folder of it, it is in use, as an engine says it."""
@@ -236,15 +241,12 @@ class Removals:
         text = f"remove {volume}: volume is in use: containers run that may have a folder of it open"
         return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
 
-    async def _removed(
-        self, things: Collection[str], path: str, *, itself: str = "", named: bool = False
-    ) -> Answer | None:
+    async def _removed(self, things: Collection[str], path: str, *, named: bool = False) -> Answer | None:
         """What the engine says to a removal; None: others run, and it was asked for none.
 
         Args:
             things: What is removed.
             path: By what path and query.
-            itself: Who ends before the files are removed.
             named: A volume that whoever knows its name could have, another orchestrator at this engine too.
         """
         if self._kin.lost:
@@ -253,14 +255,14 @@ class Removals:
             return None
         if len(self._removals) >= _MOST_REMOVALS:
             raise BusyError("too much is being removed")
-        task = begun(self._remove(things, path, itself, named=named))
+        task = begun(self._remove(things, path, named=named))
         self._removals[task] = things
         task.add_done_callback(self._removals.pop)
         return await asyncio.shield(task)
 
-    async def _remove(self, things: Collection[str], path: str, itself: str, *, named: bool) -> Answer | None:
+    async def _remove(self, things: Collection[str], path: str, *, named: bool) -> Answer | None:
         kin, starting = set(self._kin.of(things)), set(self._starts)
-        if kin & (starting | await self._running(kin - {itself})) or (named and await self._anybody_runs(self._mine)):
+        if kin & (starting | await self._running(kin)) or (named and await self._anybody_runs(self._mine)):
             return None  # among them, perhaps, whom another program of a node started
         answer = await ask_long(self._engine, path, method="DELETE")
         if answer.status < HTTPStatus.BAD_REQUEST:
@@ -312,7 +314,8 @@ class Removals:
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
-            if old := {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}:
+            cgroups = await asyncio.to_thread(Cgroups)
+            if old := {one for one in there if time.monotonic() > asked_until or await self._may_run(one, cgroups)}:
                 for paused in old:
                     if there[paused].get("State") != "paused":
                         continue
@@ -321,6 +324,7 @@ class Removals:
                     self._pauses[paused] = asyncio.Lock()
                     await self._pauses[paused].acquire()
                     begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
+            if old := old | await self._orphans(there, cgroups):
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
         except (TooMuchError, TimeoutError):  # it has so much that it takes long to tell
@@ -341,7 +345,7 @@ class Removals:
             for one in joining:
                 while not await self._is_settled(one):
                     await asyncio.sleep(_SETTLED_S)
-            await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+            await self._go_on(container)
         finally:
             self._pauses[container].release()
             self._has_joined(container)
@@ -353,27 +357,42 @@ class Removals:
         async def look() -> None:
             for container in waiting:
                 noted = self._noted
-                if await self._may_run(container) or noted != self._noted:  # or it may have been started since
+                if await self._may_run(container, cgroups) or noted != self._noted:  # or it may have been started since
                     found.add(container)
                 elif container not in self._starts:
                     self._kin.leave(container)
 
         async with self._looking:
+            cgroups = await asyncio.to_thread(Cgroups)
             await asyncio.gather(*(look() for _ in range(_MOST_ASKED)))
         return found
 
-    async def _may_run(self, container: str) -> bool:
+    async def _may_run(self, container: str, cgroups: Cgroups) -> bool:
         """Each is asked for: with a full disk, an engine (20.10) may start one that its list never says to run.
 
-        It says nothing of one that it starts just now, as an earlier program may have asked it to.
+        It says nothing of one that it starts just now, as an earlier program may have asked it to. And of one that does
+        not run, processes may go on.
         """
         try:
             answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
-            if answer.status == HTTPStatus.NOT_FOUND:
-                return False
-            return picked(answer.content, "State", "Running")["State"]["Running"] is not False
+            gone = answer.status == HTTPStatus.NOT_FOUND
+            if not gone and picked(answer.content, "State", "Running")["State"]["Running"] is not False:
+                return True
         except (OSError, ValueError, LookupError, TypeError):
             return True
+        return cgroups.go_on(container)
+
+    async def _orphans(self, known: Container[str], cgroups: Cgroups) -> set[str]:
+        """Containers of which the engine knows nothing any more, and of which processes go on."""
+        found = set[str]()
+        for container in cgroups.of_docker():
+            if container not in known:
+                with contextlib.suppress(OSError, ValueError):  # it knows it
+                    path = f"/containers/{container}/json"
+                    answer = await ask_soon(self._engine, path, patience=_SETTLED_S)
+                    if answer.status == HTTPStatus.NOT_FOUND and cgroups.go_on(container):
+                        found.add(container)
+        return found
 
     async def _is_settled(self, container: str) -> bool:
         """Whether an engine says anything of it: not while it starts it."""
@@ -390,10 +409,11 @@ class Removals:
                 there = await self._containers()
             except ValueError:
                 return True
+            cgroups = await asyncio.to_thread(Cgroups)
             for one in sorted(there, key=lambda one: one.get("State") != "running"):
-                if one["Id"] not in but and await self._may_run(one["Id"]):
+                if one["Id"] not in but and await self._may_run(one["Id"], cgroups):
                     return True
-        return False
+            return bool(await self._orphans({*but, *(one["Id"] for one in there)}, cgroups))
 
     async def _containers(self) -> list[dict[str, Any]]:
         """All of orchestrators."""

@@ -108,10 +108,11 @@ class NodeProgram:
             async with asyncio.TaskGroup() as group:
                 self._group = group
                 self._learn(self._config.urls)
+                back = group.create_task(self._gate.look_back()) if self._gate else None
                 while self._is_joined():
                     await asyncio.sleep(LOOK_S)
-                for link in self._links.values():
-                    link.cancel()
+                for task in (*self._links.values(), *([back] if back else [])):
+                    task.cancel()
             log.info("this machine is no site any more")
         finally:
             self._names.close()

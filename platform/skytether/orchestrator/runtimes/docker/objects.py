@@ -57,7 +57,7 @@ HELPER = f"{_PREFIX}/helper"
 INNER = f"{INNER_PORT}/udp"
 _EXPOSED: dict[str, dict[str, str]] = {INNER: {}}
 _MANAGED = {"app.kubernetes.io/managed-by": "skytether"}
-_HELPS = {"ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode": "none"}
+_HELPS = {"Init": True, "ReadonlyRootfs": True, "PidsLimit": 16, "Memory": 64 << 20, "IpcMode": "none"}
 """Of whom no service is asked."""
 _MOST_VOLUMES = 32
 """That an image may declare: an engine makes, mounts and removes each of them, and answers nobody meanwhile."""

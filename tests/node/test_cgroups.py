@@ -1,0 +1,49 @@
+"""Which containers have processes, by groups as the kernel shows them."""
+
+import pytest
+
+from skytether.node.cgroups import Cgroups
+
+ONE, OTHER, POD, OLD = ("1" * 64, "2" * 64, "3" * 64, "4" * 64)
+
+
+def group(folder, *, lives):
+    folder.mkdir(parents=True)
+    (folder / "cgroup.procs").write_text("")
+    (folder / "tasks").write_text("7\n" if lives else "")
+
+
+@pytest.fixture
+def root(tmp_path):
+    for hierarchy in ("memory", "pids"):
+        group(tmp_path / hierarchy, lives=True)
+    top = tmp_path / "pids"
+    group(top / "docker" / ONE, lives=True)
+    group(top / OTHER, lives=False)
+    group(top / "system.slice" / f"docker-{OLD}.scope", lives=True)
+    group(top / "kubepods" / "burstable" / POD, lives=True)
+    return tmp_path
+
+
+def test_who_has_processes_goes_on(root):
+    found = Cgroups(root)
+    assert [one for one in (ONE, OTHER, POD, OLD, "5" * 64) if found.go_on(one)] == [ONE, POD, OLD]
+    assert found.of_docker() == {ONE, OTHER, OLD}
+    (root / "pids" / "docker" / ONE / "tasks").write_text("")
+    assert not found.go_on(ONE), "it is looked at anew"
+
+
+def test_of_the_second_version_each_group_says_it_with_those_below(tmp_path):
+    scope = tmp_path / "system.slice" / f"docker-{ONE}.scope"
+    for folder in (tmp_path, scope, tmp_path / "docker" / OTHER):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "cgroup.procs").write_text("")
+        (folder / "cgroup.events").write_text(f"populated {int(folder == scope)}\nfrozen 0\n")
+    found = Cgroups(tmp_path)
+    assert (found.go_on(ONE), found.go_on(OTHER)) == (True, False)
+    assert found.of_docker() == {ONE, OTHER}
+
+
+def test_where_there_are_no_groups_nobody_is_known_to_go_on(tmp_path):
+    assert not Cgroups(tmp_path).go_on(ONE)
+    assert Cgroups(tmp_path).of_docker() == set()
