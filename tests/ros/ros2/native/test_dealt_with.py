@@ -43,12 +43,12 @@ def velocities(clock):
     return made
 
 
-def done(number, newest, published, unread_s=0.0):
-    return dealt_with(CHANNEL, DealtWith(number, newest, published, unread_s, True, 1))
+def done(number, newest, published, heard=0):
+    return dealt_with(CHANNEL, DealtWith(number, newest, heard, published, 0.0, True, 1))
 
 
 def test_what_it_says_comes_as_it_went():
-    said = DealtWith(2**40, 7, 5, 0.25, True, 3)
+    said = DealtWith(2**40, 7, 6, 5, 0.25, True, 3)
     assert pull_dealt_with(dealt_with(CHANNEL, said).body) == said
 
 
@@ -77,8 +77,20 @@ def test_what_is_not_over_yet_is_neither_lost_nor_left(clock, velocities):
         velocities.put(b"velocity")
     velocities.on_frame(done(1, 1, 1))
     assert (velocities.left_at, velocities.lost, velocities.heard_at) == (2.0, False, -handles.inf)
-    velocities.on_frame(done(2, 1, 1))
+    velocities.on_frame(done(1, 1, 1, heard=1))
+    velocities.on_frame(done(2, 1, 1, heard=1))
     assert (velocities.left_at, velocities.lost, velocities.heard_at) == (2.0, True, 2.0)
+
+
+def test_what_all_have_acknowledged_is_known_as_soon_as_it_is_and_of_none_that_never_left(clock, velocities):
+    for clock[0] in (2.0, 2.01, 2.02, 2.03):
+        velocities.put(b"velocity")
+    velocities.on_frame(done(3, 3, 2))
+    assert velocities.heard_at == -handles.inf
+    velocities.on_frame(done(3, 3, 2, heard=3))
+    assert (velocities.heard_at, velocities.left_at) == (2.02, 2.02)
+    velocities.on_frame(done(4, 3, 2, heard=3))
+    assert (velocities.heard_at, velocities.lost) == (2.02, True)
 
 
 def test_what_is_said_again_changes_nothing(clock, velocities):

@@ -133,6 +133,8 @@ class Publication(Handle):
         self._numbers = itertools.count(1)
         self._waiting: deque[tuple[int, float]] = deque()
         """Number and time [s] of each that the program has not dealt with, where `fresh_s` says how old one may get."""
+        self._unheard: deque[tuple[int, float]] = deque(maxlen=MAX_WAITING)
+        """The same of those that it has dealt with, and nobody is known to have acknowledged."""
         self._unread: tuple[float, float] = (0.0, 0.0)
         """When the program said for how long what was published is unread, and that [s]."""
         self._published = 0
@@ -204,18 +206,19 @@ class Publication(Handle):
     def on_frame(self, frame: Frame) -> None:
         done = pull_dealt_with(frame.body)
         with self._lock:
-            self._heard, self.renewed = done.heard, done.renewed
+            self._heard, self.renewed = done.hears, done.renewed
             self._unread = (_now(), done.unread_s)
             new, self._published = done.published - self._published, done.published
             over = 0
-            if self._waiting and self._waiting[0][0] <= done.number and not done.unread_s:  # before this one
-                self.heard_at = self.left_at
             while self._waiting and self._waiting[0][0] <= done.number:
                 number, at = self._waiting.popleft()
                 over += 1
                 self.lost = number > done.newest
+                self._unheard.append((number, at))
                 if number == done.newest:
                     self.left_at = at
+            while self._unheard and self._unheard[0][0] <= done.heard:
+                self.heard_at = self._unheard.popleft()[1]
             self.passed += new
             self.dropped += over - new  # too old, or a newer one came before their turn
 
@@ -232,6 +235,7 @@ class Publication(Handle):
         with self._lock:
             self.dropped += len(self._waiting)
             self._waiting.clear()
+            self._unheard.clear()
             self._unread = (0.0, 0.0)
             self._published = 0
             self._heard = False

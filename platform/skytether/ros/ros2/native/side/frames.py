@@ -26,7 +26,7 @@ NUMBER = struct.Struct("<Q")
 FOR_ALL, FIRST_WORD = -1, -2
 """Messages that go to whoever listens; the second is good as the first that somebody hears."""
 FRESH = struct.Struct("<Qdq")
-_DEALT_WITH = struct.Struct("<QQQd?q")
+_DEALT_WITH = struct.Struct("<QQQQd?q")
 SHUT_DOWN = 3
 """Exit code of the program whose ROS 2 was shut down under it."""
 MAX_BODY = 512 * 1024 * 1024
@@ -59,11 +59,13 @@ class DealtWith(NamedTuple):
     """Of the last that it is done with, and with all before it."""
     newest: int
     """Of the last of those that was published; 0: none was."""
+    heard: int
+    """Of the last of these that all who listen have acknowledged, as far as they do that; 0: none is."""
     published: int
     """How many were."""
     unread_s: float
     """For how long all before are not acknowledged [s]."""
-    heard: bool
+    hears: bool
     """Whether somebody listens, and everybody who does is known to hear, or has had the time to begin."""
     renewed: int
     """How often somebody began to listen who is to hear a first word."""

@@ -59,7 +59,8 @@ class FreshPublisher:
         self._nodes = partial(graph.listeners, node, publisher.topic_name)
         self._came = came
         self._published, self._published_at = 0, now()
-        self._number = self._newest = 0
+        self._number = self._newest = self._heard = 0
+        """Of the last message that was dealt with, published, and acknowledged."""
         self._read = True
 
     def publish(self, number: int, until: float, renewed: int, body: bytes) -> None:
@@ -82,11 +83,13 @@ class FreshPublisher:
 
     def _publish(self, until: float, renewed: int, body: bytes) -> bool:
         hearing, publisher, now = self._hearing, self._publisher, self._now()
-        if now - self._published_at < self._lifespan_s:  # or DDS has let go of it, and calls it acknowledged
+        if self._is_kept():
             self._read = _has_been_read(publisher, _AT_ONCE)
         with self._lock:
             came, there = self._came(), self._nodes()
             hearing.update(publisher.get_subscription_count(), came, self._read, now, there)
+            if not hearing.unread_s:
+                self._heard = self._newest
         with self._speaking():
             known = renewed in (FOR_ALL, FIRST_WORD) or (
                 renewed == hearing.renewed
@@ -110,12 +113,24 @@ class FreshPublisher:
             self._hearing.look(self._publisher.get_subscription_count(), self._came(), self._now(), self._nodes())
             return self._hearing.renewed != before
 
+    def hear(self) -> bool:
+        """See whether all has been acknowledged that was published, and whether that is new."""
+        with self._lock:
+            heard = self._heard
+            if self._newest > heard and _has_been_read(self._publisher, _AT_ONCE) and self._is_kept():
+                self._read, self._heard = True, self._newest
+            return self._heard != heard
+
+    def _is_kept(self) -> bool:
+        """Whether DDS has the last one still; else it calls it acknowledged."""
+        return self._now() - self._published_at < self._lifespan_s
+
     def answer(self, channel: int) -> Frame:
         """What the agent is told of what was dealt with."""
         hearing = self._hearing
         with self._lock:
-            told = hearing.unread_s, hearing.heard, hearing.renewed
-            return dealt_with(channel, DealtWith(self._number, self._newest, self._published, *told))
+            told = self._heard, self._published, hearing.unread_s, hearing.heard, hearing.renewed
+            return dealt_with(channel, DealtWith(self._number, self._newest, *told))
 
     def say_farewell(self, body: bytes, after_s: float, page: Callable[[], bytes]) -> None:
         """Publish a last word until it is acknowledged.

@@ -61,6 +61,8 @@ MAX_ASKED = 64
 """Calls of one service that wait for the agent; who comes then is not answered."""
 NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
+HEAR_S, HEARS = 0.005, 4
+"""Between looks whether what was published is acknowledged, and how many follow each."""
 VELOCITIES = {"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"}
 """Late, they are worse than none: whoever has them drives on."""
 _TELLS_TIMES = hasattr(Subscription, "CallbackType")
@@ -108,7 +110,7 @@ class Program:
     """
 
     def __init__(self, link: socket.socket, start: dict[str, Any]) -> None:
-        self._ended = threading.Event()
+        self._ended, self._spoke = threading.Event(), threading.Event()
         # A log file below the home folder is of use to nobody, and where that cannot be written there is no node.
         arguments = ["skytether", "--ros-args", "--disable-external-lib-logs", *start["arguments"]]
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
@@ -152,7 +154,7 @@ class Program:
     def run(self, stream: Any) -> int:
         """Be the node until the agent's end of the socket is closed, or ROS 2 is shut down; returns the exit code."""
         self._stalls = Stalls(_now())  # to become the node took its time
-        for job in (lambda: self._read(stream), self._watch, self._turn):
+        for job in (lambda: self._read(stream), self._watch, self._turn, self._hear):
             threading.Thread(target=job, daemon=True).start()
         alive_at = 0.0
         while not self._ended.is_set() and rclpy.ok():
@@ -214,6 +216,7 @@ class Program:
                     publication.publish(*pull_fresh(frame.body))
                 finally:  # or what waits for an answer would wait for ever
                     self._sender.put(publication.answer(frame.channel))
+                    self._spoke.set()
         elif frame.kind is Kind.CONTROL:
             what = json.loads(frame.body)
             try:
@@ -329,6 +332,19 @@ class Program:
                 with contextlib.suppress(Exception):  # it is seen, and told, with what is published next
                     if publication.look():
                         self._sender.put(publication.answer(channel))
+
+    def _hear(self) -> None:
+        """Thread that sees it soon when all who listen have acknowledged what was published."""
+        while not self._ended.is_set():
+            self._spoke.wait(TURN_S)
+            self._spoke.clear()
+            for _ in range(HEARS):
+                if self._ended.wait(HEAR_S):
+                    return
+                for channel, publication in list(self._fresh.items()):
+                    with contextlib.suppress(Exception):
+                        if publication.hear():
+                            self._sender.put(publication.answer(channel))
 
     def _do_serve(self, channel: int, name: str, kind: str, priority: int) -> None:
         self._names[channel] = name
