@@ -27,6 +27,7 @@ import pytest
 
 from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import closed, splice
+from skytether.node.cgroups import Cgroups
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
@@ -175,7 +176,8 @@ class Engine:
 
 
 @pytest.fixture
-def engine() -> Iterator[Engine]:
+def engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Engine]:
+    monkeypatch.setattr("skytether.node.removals.Cgroups", lambda: Cgroups(tmp_path))  # those of this machine's own
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
         made = Engine(Path(folder) / "e.sock")
         yield made

@@ -36,6 +36,10 @@ _LINK, _NO_FILE = 1 << 27, 1 << 19
 _USERS = {"/etc/passwd", "/etc/group"}
 """An engine reads them as it starts a container: of a pipe it waits for ever, of a device it takes all that comes, and
 of a file it keeps each line that fits."""
+_SBIN, _SBINS = "/sbin", ("/bin", "/sbin", "/usr/bin", "/usr/sbin")
+"""Where an engine mounts its own first process, and where a link may lead that an image has there. A volume over that
+would have another in its place."""
+_INIT = "docker-init"
 _MOST_USERS = 1 << 20
 """Bytes in one of these."""
 _BLOCK = 512
@@ -107,6 +111,9 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
         for above in mounts:
             if path.startswith(f"{above.rstrip('/')}/"):
                 return f"{path} is in {above}, where things can be moved"
+    for path in (*mounts, *_in_memory(inspected)):
+        if any(f"{folder}/{_INIT}/".startswith(f"{path.rstrip('/')}/") for folder in _SBINS):
+            return f"{path} is where the engine's own first process is"
     # Nothing is mounted there that the kernel would hold: what ran could leave a pipe, for the next start.
     users = (path for path in sorted(_USERS) if any(path == one or path.startswith(f"{one}/") for one in mounts))
     return next((f"{path} is in a volume, where things can be moved" for path in users), None)
@@ -121,21 +128,22 @@ def ways(inspected: Mapping[str, Any]) -> set[str]:
     """All folders and files that must be no links, in the image of a container."""
     mounts = (str(one["Destination"]) for one in inspected.get("Mounts") or ())
     ends = [PurePosixPath(path) for path in (*mounts, *_FILES, *_in_memory(inspected))]
-    return _USERS | {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
+    return _USERS | {_SBIN} | {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
 
 
 def pull_stat(headers: Mapping[str, str]) -> dict[str, Any] | None:
     """What an engine says of one file in the heads of its answer, whose names are in lower case."""
     try:
         stat = json.loads(base64.b64decode(headers[STAT.lower()]))
-        return {"size": int(stat["size"]), "mode": int(stat["mode"]), "mtime": str(stat["mtime"])}
+        told = {"size": int(stat["size"]), "mode": int(stat["mode"]), "mtime": str(stat["mtime"])}
+        return {**told, "linkTarget": str(stat["linkTarget"])}
     except (LookupError, TypeError, ValueError):
         return None
 
 
 def push_stat(name: str, stat: Mapping[str, Any]) -> str:
     """The same as an engine says it of a file, which is no link."""
-    return base64.b64encode(json.dumps({"name": name, **stat, "linkTarget": ""}).encode()).decode()
+    return base64.b64encode(json.dumps({**stat, "name": name, "linkTarget": ""}).encode()).decode()
 
 
 def is_odd(stat: Mapping[str, Any]) -> bool:
@@ -147,4 +155,6 @@ def misleads(path: str, stat: Mapping[str, Any]) -> bool:
     """Whether what an image has at a path is a link, or no file where there must be one, or a large one."""
     if path in _USERS:
         return is_odd(stat) or stat["size"] > _MOST_USERS
+    if path == _SBIN and stat["linkTarget"] in _SBINS:
+        return False
     return bool(stat["mode"] & _LINK)

@@ -35,6 +35,11 @@ class Cgroups:
         """Whether it has processes now."""
         return any(map(_has_process, self._folders.get(container, {})))
 
+    def kill(self, container: str) -> str:
+        """The command that ends its processes."""
+        groups = " ".join(f"{folder}/cgroup.procs" for folder in self._folders.get(container, {}))
+        return f"kill -9 $(cat {groups})"
+
     def of_docker(self) -> set[str]:
         """Containers that an engine of Docker made, or may have."""
         return {container for container, folders in self._folders.items() if any(folders.values())}

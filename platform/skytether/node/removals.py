@@ -42,6 +42,7 @@ _MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN = 512, 128, 4
 """Under way at a time, and in line for one network: an engine may take its time for each, and whoever asked may be gone
 meanwhile."""
 _MOST_MINE = 1 << 15
+_MOST_TOLD = 100
 _MOST_ASKED = 32
 """Containers that are asked for at a time: of one that an engine just starts it says nothing for some seconds."""
 _MODE = "HostConfig.NetworkMode"
@@ -89,6 +90,8 @@ class Removals:
         """They do one at a time."""
         self._ending: Counter[str] = Counter()
         """Of calls by which a container may end."""
+        self._told: set[str] = set()
+        """Containers of whose processes it was told that they go on."""
         self._noted = 0
         """Starts, so far."""
         self._removals: dict[asyncio.Task[Answer | None], Collection[str]] = {}
@@ -238,7 +241,7 @@ class Removals:
         named = not _OWN.fullmatch(volume)
         if (removed := await self._removed((_VOLUME + volume,), path, named=named)) is not None:
             return removed
-        text = f"remove {volume}: volume is in use: containers run that may have a folder of it open"
+        text = f"remove {volume}: volume is in use: containers run that may have a folder of it open, or go on"
         return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
 
     async def _removed(self, things: Collection[str], path: str, *, named: bool = False) -> Answer | None:
@@ -314,17 +317,16 @@ class Removals:
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
-            cgroups = await asyncio.to_thread(Cgroups)
-            if old := {one for one in there if time.monotonic() > asked_until or await self._may_run(one, cgroups)}:
-                for paused in old:
-                    if there[paused].get("State") != "paused":
-                        continue
-                    joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
-                    self._joined[paused] += 1
-                    self._pauses[paused] = asyncio.Lock()
-                    await self._pauses[paused].acquire()
-                    begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
-            if old := old | await self._orphans(there, cgroups):
+            old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
+            for paused in old:
+                if there[paused].get("State") != "paused":
+                    continue
+                joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
+                self._joined[paused] += 1
+                self._pauses[paused] = asyncio.Lock()
+                await self._pauses[paused].acquire()
+                begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
+            if old := old | await self._going_on(there):
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
         except (TooMuchError, TimeoutError):  # it has so much that it takes long to tell
@@ -352,46 +354,65 @@ class Removals:
 
     async def _running(self, things: Iterable[str]) -> set[str]:
         """Those of these containers that run, or may."""
-        found, waiting = set[str](), iter([one for one in things if not one.startswith(_VOLUME)])
+        found, ended = set[str](), dict[str, int]()
+        waiting = iter([one for one in things if not one.startswith(_VOLUME)])
 
         async def look() -> None:
             for container in waiting:
                 noted = self._noted
-                if await self._may_run(container, cgroups) or noted != self._noted:  # or it may have been started since
+                if await self._may_run(container) or noted != self._noted:  # or it may have been started since
                     found.add(container)
-                elif container not in self._starts:
-                    self._kin.leave(container)
+                else:
+                    ended[container] = noted
 
         async with self._looking:
-            cgroups = await asyncio.to_thread(Cgroups)
             await asyncio.gather(*(look() for _ in range(_MOST_ASKED)))
+            cgroups = await asyncio.to_thread(
+                Cgroups
+            )  # after it was asked: what has started since, and ended, is there
+            for container, noted in ended.items():
+                if self._goes_on(container, cgroups):
+                    found.add(container)
+                elif noted == self._noted and container not in self._starts:
+                    self._kin.leave(container)
         return found
 
-    async def _may_run(self, container: str, cgroups: Cgroups) -> bool:
+    async def _may_run(self, container: str) -> bool:
         """Each is asked for: with a full disk, an engine (20.10) may start one that its list never says to run.
 
-        It says nothing of one that it starts just now, as an earlier program may have asked it to. And of one that does
-        not run, processes may go on.
+        It says nothing of one that it starts just now, as an earlier program may have asked it to.
         """
         try:
             answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
-            gone = answer.status == HTTPStatus.NOT_FOUND
-            if not gone and picked(answer.content, "State", "Running")["State"]["Running"] is not False:
-                return True
+            if answer.status == HTTPStatus.NOT_FOUND:
+                return False
+            return picked(answer.content, "State", "Running")["State"]["Running"] is not False
         except (OSError, ValueError, LookupError, TypeError):
             return True
-        return cgroups.go_on(container)
 
-    async def _orphans(self, known: Container[str], cgroups: Cgroups) -> set[str]:
-        """Containers of which the engine knows nothing any more, and of which processes go on."""
-        found = set[str]()
+    def _goes_on(self, container: str, cgroups: Cgroups) -> bool:
+        """Whether processes of a container go on of which the engine says that it does not run."""
+        if not cgroups.go_on(container):
+            return False
+        if container not in self._told and len(self._told) < _MOST_TOLD:
+            self._told.add(container)
+            ends = cgroups.kill(container)
+            log.warning("processes of container %s go on though it has ended; volumes stay until %s", container, ends)
+        return True
+
+    async def _going_on(self, known: Collection[str], but: Container[str] = ()) -> set[str]:
+        """Containers whose processes go on: of those that the engine lists, and of those that it knows nothing of."""
+        cgroups = await asyncio.to_thread(Cgroups)
+        found = {one for one in known if one not in but and cgroups.go_on(one)}
         for container in cgroups.of_docker():
-            if container not in known:
-                with contextlib.suppress(OSError, ValueError):  # it knows it
+            if container not in known and container not in but and cgroups.go_on(container):
+                gone = True
+                with contextlib.suppress(OSError, ValueError):  # who says nothing says not that it knows it
                     path = f"/containers/{container}/json"
                     answer = await ask_soon(self._engine, path, patience=_SETTLED_S)
-                    if answer.status == HTTPStatus.NOT_FOUND and cgroups.go_on(container):
-                        found.add(container)
+                    gone = answer.status == HTTPStatus.NOT_FOUND
+                if gone and self._goes_on(container, cgroups):
+                    found.add(container)
         return found
 
     async def _is_settled(self, container: str) -> bool:
@@ -409,11 +430,10 @@ class Removals:
                 there = await self._containers()
             except ValueError:
                 return True
-            cgroups = await asyncio.to_thread(Cgroups)
             for one in sorted(there, key=lambda one: one.get("State") != "running"):
-                if one["Id"] not in but and await self._may_run(one["Id"], cgroups):
+                if one["Id"] not in but and await self._may_run(one["Id"]):
                     return True
-            return bool(await self._orphans({*but, *(one["Id"] for one in there)}, cgroups))
+            return bool(await self._going_on({one["Id"] for one in there}, but))
 
     async def _containers(self) -> list[dict[str, Any]]:
         """All of orchestrators."""

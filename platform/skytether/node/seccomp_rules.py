@@ -8,6 +8,7 @@ taken, each of them once.
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Mapping
 from typing import Any
@@ -33,6 +34,7 @@ _OF_FILTERS = [{"index": 0, "value": 16, "op": "SCMP_CMP_EQ"}, {"index": 2, "val
 """Arguments of sockets of AF_NETLINK, that for netfilter."""
 _NEEDED = {"close", "close_range", "execve", "exit_group", "futex", "mmap", "openat", "read", "write"}
 """What runc calls by a container's profile before it is that container. Without one, it may never end, nor start."""
+_AGAIN = {errno.EINTR, errno.EAGAIN}
 _MOST_ERRNO = 4096
 """Of the kernel."""
 _PROFILE = {"defaultAction", "defaultErrnoRet", "archMap", "architectures", "syscalls"}
@@ -98,8 +100,11 @@ def _named(entry: Mapping[str, Any]) -> set[Any]:
 
 
 def _is_error(number: Any) -> bool:
-    """By zero a call that was not made seems to have gone well; runc keeps 16 bits of it."""
-    return number is None or (type(number) is int and 0 < number < _MOST_ERRNO)
+    """By zero a call that was not made seems to have gone well, and by others runc makes it again for ever.
+
+    Of a number it keeps 16 bits.
+    """
+    return number is None or (type(number) is int and 0 < number < _MOST_ERRNO and number not in _AGAIN)
 
 
 def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

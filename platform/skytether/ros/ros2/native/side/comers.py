@@ -7,7 +7,7 @@ from typing import Any
 
 MOST = 256
 """Names of those who left that are known."""
-FINDS_S = 10.0
+FINDS_S = 30.0
 """After its start a publisher that is in another's place finds who was told something by that one."""
 
 

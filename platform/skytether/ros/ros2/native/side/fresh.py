@@ -59,9 +59,9 @@ class FreshPublisher:
         self._nodes = partial(graph.listeners, node, publisher.topic_name)
         self._came = came
         self._published, self._published_at = 0, now()
-        self._number = self._newest = self._heard = 0
-        """Of the last message that was dealt with, published, and acknowledged."""
-        self._read = True
+        self._number = self._newest = self._read = self._heard = 0
+        """Of the last message that was dealt with, that was published, that DDS says was acknowledged, and that was by
+        all who do that."""
 
     def publish(self, number: int, until: float, renewed: int, body: bytes) -> None:
         """Publish a message.
@@ -83,11 +83,10 @@ class FreshPublisher:
 
     def _publish(self, until: float, renewed: int, body: bytes) -> bool:
         hearing, publisher, now = self._hearing, self._publisher, self._now()
-        if self._is_kept():
-            self._read = _has_been_read(publisher, _AT_ONCE)
         with self._lock:
+            self._see_read()
             came, there = self._came(), self._nodes()
-            hearing.update(publisher.get_subscription_count(), came, self._read, now, there)
+            hearing.update(publisher.get_subscription_count(), came, self._read == self._newest, now, there)
             if not hearing.unread_s:
                 self._heard = self._newest
         with self._speaking():
@@ -99,8 +98,9 @@ class FreshPublisher:
             )
             new = bool(known and self._now() <= until)
             if new:
-                self._published_at = self._now()
+                at = self._now()
                 publisher.publish(body)
+                self._published_at = at
         if new:
             with self._lock:
                 hearing.tell(publisher.get_subscription_count(), self._now(), first=renewed == FIRST_WORD)
@@ -117,13 +117,17 @@ class FreshPublisher:
         """See whether all has been acknowledged that was published, and whether that is new."""
         with self._lock:
             heard = self._heard
-            if self._newest > heard and _has_been_read(self._publisher, _AT_ONCE) and self._is_kept():
-                self._read, self._heard = True, self._newest
+            self._see_read()
+            self._heard = max(heard, self._read)
             return self._heard != heard
 
-    def _is_kept(self) -> bool:
-        """Whether DDS has the last one still; else it calls it acknowledged."""
-        return self._now() - self._published_at < self._lifespan_s
+    def _see_read(self) -> None:
+        """Ask DDS whether all was acknowledged; of what it has let go of it says so, too."""
+        at = self._published_at
+        if self._read == self._newest or not _has_been_read(self._publisher, _AT_ONCE):
+            return
+        if at == self._published_at and self._now() - at < self._lifespan_s:
+            self._read = self._newest
 
     def answer(self, channel: int) -> Frame:
         """What the agent is told of what was dealt with."""
