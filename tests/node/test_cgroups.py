@@ -47,3 +47,7 @@ def test_of_the_second_version_each_group_says_it_with_those_below(tmp_path):
 def test_where_there_are_no_groups_nobody_is_known_to_go_on(tmp_path):
     assert not Cgroups(tmp_path).go_on(ONE)
     assert Cgroups(tmp_path).of_docker() == set()
+
+
+def test_it_says_what_ends_them(root):
+    assert Cgroups(root).kill(ONE) == f"kill -9 $(cat {root}/pids/docker/{ONE}/cgroup.procs)"

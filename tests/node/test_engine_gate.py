@@ -27,6 +27,7 @@ import pytest
 
 from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import closed, splice
+from skytether.node.archives import misleads
 from skytether.node.cgroups import Cgroups
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
@@ -81,6 +82,8 @@ class Engine:
         self.refuses: set[str] = set()
         """What it is asked, and answers 409 to."""
         self.slow: dict[str, threading.Event] = {}
+        self.unknown: set[str] = set()
+        """Containers that are none."""
         """By what it is asked, what it waits for before it answers."""
         self.digests: list[str] = []
         """Of the image that it has by any name but "new"."""
@@ -116,7 +119,8 @@ class Engine:
                 if self.path.startswith("/distribution/"):
                     text = json.dumps({"Descriptor": {"digest": f"sha256:{ID}"}}).encode()
                 new = re.match("/images/(docker.io/)?new", self.path)
-                missing = new or (engine.emptied and self.command in ("HEAD", "DELETE"))
+                unknown = any(one in self.path for one in engine.unknown)
+                missing = new or unknown or (engine.emptied and self.command in ("HEAD", "DELETE"))
                 if self.path.startswith("/networks?"):
                     text = json.dumps([{"Name": name} for name in engine.networks]).encode()
                 if self.path.startswith("/containers/json"):
@@ -599,6 +603,18 @@ def starts(engine: Engine) -> bytes:
         ([volume("/etc/group")], {}, set(), b"/etc/group is in a volume, where things can be moved"),
         ([volume("/etc/passwd")], {}, set(), b"/etc/passwd is in a volume"),
         ([volume("/etc/passwd.d"), volume("/etcetera")], {}, set(), b""),
+        # There another program would be the first process, and no engine would end it.
+        ([volume("/usr/sbin")], {}, set(), b"/usr/sbin is where the engine's own first process is"),
+        ([volume("/sbin/docker-init")], {}, set(), b"/sbin/docker-init is where the engine's own"),
+        ([volume("/bin/docker-init")], {}, set(), b"/bin/docker-init is where the engine's own"),
+        (
+            MOUNTED,
+            {"HostConfig": {"ReadonlyRootfs": True, "Tmpfs": {"/sbin/": "exec"}}},
+            set(),
+            b"/sbin is where the engine's own first process is",
+        ),
+        ([volume("/usr/sbin2"), volume("/sbin/docker-init2")], {}, set(), b""),
+        (MOUNTED, {}, {"/sbin"}, b"/sbin is a link in its image"),
         ([volume(f"/v{number}") for number in range(64)], {}, set(), b""),
         ([volume(f"/v{number}") for number in range(65)], {}, set(), b"it has too many mounts"),
         ([volume("/a" * 600)], {}, set(), b"it has too many mounts, or at paths that are too long"),
@@ -628,6 +644,15 @@ def test_no_engine_looks_into_files_on_a_way_that_somebody_may_move(
     else:
         assert says in got
         assert sent.split(b" HTTP")[0].decode() not in engine.lines
+
+
+@pytest.mark.parametrize(("leads", "good"), [("/usr/sbin", True), ("/usr/bin", True), ("/data", False), ("", False)])
+def test_where_the_engines_first_process_is_an_image_has_no_link_but_to_where_nothing_is_mounted(
+    leads: str, good: bool
+) -> None:
+    link = {"size": 8, "mode": 1 << 27 | 0o777, "mtime": "", "linkTarget": leads}
+    assert misleads("/sbin", link) is not good
+    assert misleads("/run", link)
 
 
 def test_what_is_gone_before_it_was_looked_at_has_not_been_looked_at(engine: Engine) -> None:
@@ -1068,6 +1093,32 @@ def test_volumes_go_after_a_container_that_has_no_kin_and_has_ended(
         assert site.gate._removals._kin.all() == {Z, "volume skytether-s"}  # noqa: SLF001 all others are forgotten
 
     asyncio.run(run())
+
+
+def test_processes_that_go_on_without_a_container_keep_volumes_and_are_named(
+    engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the node was started anew, too; an engine that says nothing of them says not that it has them."""
+    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.1)
+    group = tmp_path / "pids" / "docker" / Z
+    group.mkdir(parents=True)
+    (tmp_path / "pids" / "cgroup.procs").write_text("")
+    (group / "tasks").write_text("7\n")
+    engine.others, engine.volumes, engine.unknown = {OWN: {}}, [{"Name": OWN}], {Z}
+
+    async def run() -> None:
+        for slow in ({}, {f"GET /containers/{Z}/json": threading.Event()}):
+            engine.slow = slow
+            assert b"409 Conflict" in await Site(engine).ask(f"DELETE /v1.41/volumes/{OWN}")
+            for one in slow.values():
+                one.set()
+        site, engine.slow = Site(engine), {}
+        assert b"409 Conflict" in await site.ask(f"DELETE /v1.41/volumes/{OWN}")
+        (group / "tasks").write_text("")
+        assert b"200 OK" in await site.ask(f"DELETE /v1.41/volumes/{OWN}")
+
+    asyncio.run(run())
+    assert f"kill -9 $(cat {group}/cgroup.procs)" in caplog.text
 
 
 def test_many_containers_that_no_engine_lets_go_of_hold_up_others_as_one_does(engine: Engine) -> None:
