@@ -36,7 +36,7 @@ class Wheels:
 def fresh(monkeypatch):
     for name in ("rclpy", "rclpy.duration", "rclpy.qos"):
         stand_in = ModuleType(name)
-        stand_in.__getattr__ = lambda _: Mock()
+        stand_in.__dict__["__getattr__"] = lambda _: Mock()
         monkeypatch.setitem(sys.modules, name, stand_in)
     for name in ("graph", "fresh"):
         monkeypatch.delitem(sys.modules, f"{SIDE}.{name}", raising=False)
