@@ -244,9 +244,10 @@ node.create_subscription(Twist, "/cmd_vel", lambda m: say(m.linear.x), 10)
 
         base = listen("base")
         until(lambda: drive() and not wheels.unread_s, "the base to acknowledge")
-        renewed = wheels.renewed
+        alone = wheels.renewed
         recorder = listen("recorder")
-        assert wheels.renewed == renewed == 1, "who listens besides stops nobody"
+        renewed = wheels.renewed
+        assert renewed > alone > 0, "so soon after the start it may be somebody who was told something before it"
         for end in (signal.SIGINT, signal.SIGKILL):
             base.process.send_signal(end)
             base.process.wait(10)
