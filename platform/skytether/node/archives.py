@@ -102,7 +102,8 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
     mounts = [str(one.get("Destination")) for one in inspected.get("Mounts") or ()]
     if len(mounts) > _MOST_MOUNTS or len(ways(inspected)) > _MOST_WAYS:
         return "it has too many mounts, or at paths that are too long"
-    for path in (*mounts, *_FILES, *_in_memory(inspected)):
+    made = (*mounts, *_in_memory(inspected))
+    for path in (*made, *_FILES):
         if path != "/" + posixpath.normpath(path).lstrip("/"):  # which keeps two slashes at its beginning
             # Of a volume that an image names so: what it is in or at is said by no comparison here.
             return f"{path or 'nothing'} is no whole path"
@@ -111,7 +112,7 @@ def moved(inspected: Mapping[str, Any]) -> str | None:
         for above in mounts:
             if path.startswith(f"{above.rstrip('/')}/"):
                 return f"{path} is in {above}, where things can be moved"
-    for path in (*mounts, *_in_memory(inspected)):
+    for path in made:
         if any(f"{folder}/{_INIT}/".startswith(f"{path.rstrip('/')}/") for folder in _SBINS):
             return f"{path} is where the engine's own first process is"
     # Nothing is mounted there that the kernel would hold: what ran could leave a pipe, for the next start.
@@ -135,8 +136,12 @@ def pull_stat(headers: Mapping[str, str]) -> dict[str, Any] | None:
     """What an engine says of one file in the heads of its answer, whose names are in lower case."""
     try:
         stat = json.loads(base64.b64decode(headers[STAT.lower()]))
-        told = {"size": int(stat["size"]), "mode": int(stat["mode"]), "mtime": str(stat["mtime"])}
-        return {**told, "linkTarget": str(stat["linkTarget"])}
+        return {
+            "size": int(stat["size"]),
+            "mode": int(stat["mode"]),
+            "mtime": str(stat["mtime"]),
+            "linkTarget": str(stat["linkTarget"]),
+        }
     except (LookupError, TypeError, ValueError):
         return None
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path("/sys/fs/cgroup")
@@ -29,7 +28,7 @@ class Cgroups:
     def __init__(self, root: Path = ROOT) -> None:
         tops = (root / one for one in _HIERARCHIES)
         top = next((one for one in tops if (one / "cgroup.procs").exists()), None)
-        self._folders = dict(_found(top)) if top else {}
+        self._folders = _found(top) if top else {}
 
     def go_on(self, container: str) -> bool:
         """Whether it has processes now."""
@@ -45,7 +44,7 @@ class Cgroups:
         return {container for container, folders in self._folders.items() if any(folders.values())}
 
 
-def _found(top: Path) -> Iterator[tuple[str, Mapping[Path, bool]]]:
+def _found(top: Path) -> dict[str, dict[Path, bool]]:
     """Containers, and their groups: of each, whether it may be of Docker."""
     found: dict[str, dict[Path, bool]] = {}
     for folder, _, _ in os.walk(top):
@@ -53,7 +52,7 @@ def _found(top: Path) -> Iterator[tuple[str, Mapping[Path, bool]]]:
         if named := _NAME.fullmatch(path.name):
             parent = "" if path.parent == top else path.parent.name
             found.setdefault(named[2], {})[path] = bool(named[1]) or (path.name == named[2] and parent in _PARENTS)
-    yield from found.items()
+    return found
 
 
 def _has_process(folder: Path) -> bool:

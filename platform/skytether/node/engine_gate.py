@@ -84,6 +84,7 @@ _MOST_DESCRIBED = 64 << 10
 """Bytes of what an engine says of one container."""
 _MAKES, _PULL = ("/containers/create", "/volumes/create"), "/images/create"
 _LOOK_AGAIN_S = 5.0
+"""Before the engine is asked again what was there as this program started, where it did not say."""
 _END_S = 60.0
 """What an engine may take to end a container, or to change what it may have [s]."""
 _WEIGH_S = 300.0

@@ -1,29 +1,22 @@
 """What is known of velocities that the node's program is done with, several at a time too."""
 
-from dataclasses import dataclass, field
-
 import pytest
 
 from skytether.ros.ros2.dialect import Endpoint, Kind
 from skytether.ros.ros2.native import handles
-from skytether.ros.ros2.native.side.frames import DealtWith, dealt_with, pull_dealt_with, pull_fresh
+from skytether.ros.ros2.native.side.frames import DealtWith, dealt_with, pull_dealt_with
 
 CHANNEL, FRESH_S = 1, 0.03
 
 
-@dataclass
 class Program:
     """Takes what is sent to it."""
-
-    numbers: list[int] = field(default_factory=list)
 
     def set(self, channel, priority, depth):
         """As `Sender`."""
 
     def put(self, frame):
         """As `Sender`."""
-        if frame.kind is handles.Kind.FRESH:
-            self.numbers.append(pull_fresh(frame.body)[0])
         return 0
 
 

@@ -3,7 +3,7 @@
 import contextlib
 import importlib
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from unittest.mock import Mock
 
 import pytest
@@ -50,8 +50,9 @@ def fresh(monkeypatch):
 @pytest.mark.parametrize("gap_s", [0.02, 0.035, 0.04])
 def test_who_hangs_has_acknowledged_nothing_though_dds_lets_go_of_it(fresh, gap_s):
     wheels, number = Wheels(), 0
-    parts = SimpleNamespace(came=lambda: 1, clock=lambda: wheels.now)
-    publisher = fresh.FreshPublisher(None, wheels, LIFESPAN_S, parts.came, [], contextlib.nullcontext, parts.clock)
+    publisher = fresh.FreshPublisher(
+        None, wheels, LIFESPAN_S, lambda: 1, [], contextlib.nullcontext, lambda: wheels.now
+    )
 
     def publish(times):
         nonlocal number

@@ -9,9 +9,9 @@ uint32 length of the body, uint8 kind, uint32 channel, body. Bodies by kind:
 - FAILURE: uint64 number of the call, why it failed as UTF-8;
 - FRESH: uint64 number of the message, float64 time of CLOCK_BOOTTIME, int64 for whom, serialised message, which is
   published until then or never, and to nobody who came later: for whom is how often somebody had come who is to hear a
-  first word, or `FOR_ALL` or `FIRST_WORD`; from the node what `DealtWith` has, in this order:
-  that message, and those before it, wait no more. A velocity of a subscription comes from the node
-  as others go to it, and is taken until then or never.
+  first word, or `FOR_ALL` or `FIRST_WORD`; from the node what `DealtWith` has, in this order: that message, and those
+  before it, wait no more. A velocity of a subscription comes from the node as others go to it, and is taken until then
+  or never.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ MAX_ASKED = 64
 NAMED_S = 1.0
 """For an endpoint's node to be known, which comes a moment later; then it counts without a name."""
 HEAR_S, HEARS = 0.005, 4
-"""Between looks whether what was published is acknowledged, and how many follow each."""
+"""Between looks whether a message is acknowledged, and how many of them follow each message."""
 VELOCITIES = {"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"}
 """Late, they are worse than none: whoever has them drives on."""
 _TELLS_TIMES = hasattr(Subscription, "CallbackType")
@@ -336,7 +336,8 @@ class Program:
     def _hear(self) -> None:
         """Thread that sees it soon when all who listen have acknowledged what was published."""
         while not self._ended.is_set():
-            self._spoke.wait(TURN_S)
+            if not self._spoke.wait(TURN_S):
+                continue
             self._spoke.clear()
             for _ in range(HEARS):
                 if self._ended.wait(HEAR_S):
