@@ -93,6 +93,24 @@ def test_whoever_is_found_soon_after_the_publisher_began_is_to_hear_a_first_word
     assert publisher.publish("ebn", True).renewed == before + 1
 
 
+def test_the_first_whom_the_graph_shows_later_counts_once():
+    hearing = Hearing(began=100.0)
+    for now, came, nodes in ((100.0, 0, {}), (100.1, 1, {}), (100.2, 1, {1: "b"}), (100.3, 1, {1: "b"})):
+        hearing.update(1, came, True, now, nodes)
+        hearing.tell(1, now, first=not nodes)
+    assert hearing.renewed == 1
+    assert not hearing.holds
+    hearing.update(2, 2, True, 100.4, {1: "b", 2: "e"})
+    assert hearing.renewed == 2, "this one came after that word"
+
+
+def test_who_is_shown_in_the_place_of_the_first_is_to_hear_a_first_word():
+    hearing = Hearing(began=100.0)
+    hearing.update(1, 0, True, 100.0, {})
+    hearing.update(1, 2, True, 100.1, {2: "b"})
+    assert hearing.renewed == 2
+
+
 def test_who_has_no_name_for_long_is_to_hear_a_first_word(publisher):
     publisher.publish("b", True, 5)
     renewed = publisher.hearing.renewed

@@ -43,13 +43,15 @@ class Hearing:
         self._told_since: float | None = None
         """Since when those who listen are told something, who came last too [s]; None: they are not yet."""
         self._listeners = 0
-        self._came: int | None = 0
+        self._came = 0
         self._comers = Comers(awaited)
         self._shown: set[Any] = set()
         self._pending: dict[Any, float] = {}
         """Whom the graph shows, and who does not listen yet, as far as is known; since when [s]."""
         self._is_one_coming = self._hidden = False
         """The second: one came in another's place, whom the graph does not show yet."""
+        self._unshown = False
+        """Whether the graph does not show the first who came yet; he is to hear a first word already."""
         self._doubted_at: float | None = None
         """Since when it is not known whether somebody who came is to hear a first word [s]."""
 
@@ -71,10 +73,15 @@ class Hearing:
             Whether somebody left, or came who is to hear a first word.
         """
         before, self._listeners = self._listeners, listeners
-        came_before, self._came = self._came, came
-        new = came - came_before if came is not None and came_before is not None else 0
+        new = 0
+        if came is not None:  # it is told after they are counted
+            new = max(came - self._came, listeners - before, 0)
+            self._came += new
         here = self._connected(nodes, listeners, now, told=came is None or new > 0)
-        back = self._comers.is_anybody_back(here, young=now - self._began < FINDS_S)
+        self._unshown = self._unshown and came is not None and not new
+        young = now - self._began < FINDS_S and not self._unshown
+        back = self._comers.is_anybody_back(here, young=young)
+        self._unshown = self._unshown and not self._comers.changed
         self._hidden = not self._comers.changed and (self._hidden or new > max(0, listeners - before))
         if not self._comers.doubtful and not self._hidden and listeners <= len(here):
             self._doubted_at = None
@@ -86,6 +93,7 @@ class Hearing:
         elif not before:
             self.renewed += 1
             self._settle()
+            self._unshown = not here
         elif back or (listeners > before and self.unread_s > SILENT_S):
             # The wheels' node may have been started again, beside somebody else.
             self.heard, self._told_since = False, None
