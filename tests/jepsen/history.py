@@ -10,7 +10,7 @@ Every entry has ``t``, seconds of the monotonic clock since the run began, and `
 | ``look`` | ``place``, ``runs``: names of the runs of each instance that live at the same time |
 | ``leader`` | ``leaders``: the number of the orchestrator that leads by the database, and can; empty: nobody does |
 | ``fault`` | ``fault``, ``step`` (begin, heal, over), ``hits``: the instances of which a run was hit |
-| ``traceback`` | ``line``: of an orchestrator's log, before a traceback |
+| ``traceback`` | ``line``: of an orchestrator's log, and the traceback that follows it |
 | ``final`` | ``when`` (settled, drained), ``instances`` and ``events`` as in the database, ``runs``; ``standbys``: how many there are to be, by service |
 """  # noqa: E501 (a table)
 

@@ -14,7 +14,9 @@ from .history import History
 
 _LEADS = re.compile(rb"this orchestrator leads: [^\n]*\(epoch (\d+)\)")
 _LEADER = "SELECT epoch FROM leadership WHERE until > extract(epoch FROM clock_timestamp())"
-_TRACEBACK = re.compile(rb"^(\d{4}-[^\n]*)\n[^\n]*Traceback \(most recent call last\)", re.MULTILINE)
+_TRACEBACK = re.compile(
+    rb"^(\d{4}-[^\n]*\nTraceback \(most recent call last\)[^\n]*(?:\n(?!\d{4}-)[^\n]*)*)", re.MULTILINE
+)
 _PROCESSES_S, _CONTAINERS_S, _LEADERS_S = 0.1, 0.25, 0.05
 _HANGS_S = 0.5
 """A database that takes so long for an answer has hung."""
@@ -40,7 +42,7 @@ class Log:
         self._read = 0
 
     def look(self) -> tuple[list[int], list[str]]:
-        """Epochs in which it began to lead, and lines before tracebacks."""
+        """Epochs in which it began to lead, and tracebacks with the line before."""
         with self._path.open("rb") as file:
             file.seek(self._read)
             text = file.read()

@@ -615,6 +615,7 @@ def starts(engine: Engine) -> bytes:
         ),
         ([volume("/usr/sbin2"), volume("/sbin/docker-init2")], {}, set(), b""),
         (MOUNTED, {}, {"/sbin"}, b"/sbin is a link in its image"),
+        (MOUNTED, {}, {"/sbin/docker-init"}, b"/sbin/docker-init is a link in its image"),
         ([volume(f"/v{number}") for number in range(64)], {}, set(), b""),
         ([volume(f"/v{number}") for number in range(65)], {}, set(), b"it has too many mounts"),
         ([volume("/a" * 600)], {}, set(), b"it has too many mounts, or at paths that are too long"),

@@ -38,7 +38,7 @@ _USERS = {"/etc/passwd", "/etc/group"}
 of a file it keeps each line that fits."""
 _SBIN, _SBINS = "/sbin", ("/bin", "/sbin", "/usr/bin", "/usr/sbin")
 """Where an engine mounts its own first process, and where a link may lead that an image has there. A volume over that
-would have another in its place."""
+would have another in its place; so would one over what a link there leads to, which is mounted later."""
 _INIT = "docker-init"
 _MOST_USERS = 1 << 20
 """Bytes in one of these."""
@@ -129,7 +129,8 @@ def ways(inspected: Mapping[str, Any]) -> set[str]:
     """All folders and files that must be no links, in the image of a container."""
     mounts = (str(one["Destination"]) for one in inspected.get("Mounts") or ())
     ends = [PurePosixPath(path) for path in (*mounts, *_FILES, *_in_memory(inspected))]
-    return _USERS | {_SBIN} | {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
+    parts = {str(part) for end in ends for part in (end, *end.parents) if part != PurePosixPath("/")}
+    return _USERS | {_SBIN, f"{_SBIN}/{_INIT}"} | parts
 
 
 def pull_stat(headers: Mapping[str, str]) -> dict[str, Any] | None:
