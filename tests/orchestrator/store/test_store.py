@@ -7,10 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from threading import Barrier
+from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from sqlalchemy import Engine, event
 
 from skytether.api.pull_progress import PullProgress
 from skytether.api.rest import SiteCreate, State
@@ -106,6 +108,30 @@ def test_all_that_changed_is_read_by_who_saw_it_before(tmp_path: Path, store: St
         claimed = store.claim(Change(standby, {"robot": "walker", "standby": False}), NOW, "", None, "")
         assert claimed is not None
         assert other.live() == [claimed]
+
+
+@pytest.mark.parametrize("seen", [True, False], ids=["seen before", "new"])
+def test_what_changes_while_it_is_listed_is_listed_only_if_it_fits_still(
+    tmp_path: Path, store: Store, new_record: NewRecord, seen: bool
+) -> None:
+    """A list is read in two steps, and others change and end instances between them."""
+    warm = [
+        store.add(new_record(name, robot="", standby=True, state=State.RUNNING, site="lab"), "", None, "")
+        for name in ("ended", "given", "left", "stays")
+    ]
+    with closing(Store(f"sqlite:///{tmp_path}/state.db")) as other:
+        if seen:
+            assert other.live_standbys() == warm
+            warm = [now for one in warm if (now := store.change(Change(one, {"reason": "seen by nobody yet"}), NOW))]
+        ended, given, left, _ = warm
+
+        @event.listens_for(Engine, "after_cursor_execute", once=True)
+        def change(*_: Any) -> None:
+            store.change(Change(ended, {"state": State.FAILED}), NOW)
+            store.claim(Change(given, {"robot": "walker", "standby": False}), NOW, "", None, "")
+            store.change(Change(left, {"reason": "it has another reason"}), NOW)
+
+        assert [one.id for one in other.live_standbys()] == ["left", "stays"]
 
 
 def test_standbys_and_reports_that_matter_alone(store: Store, new_record: NewRecord) -> None:

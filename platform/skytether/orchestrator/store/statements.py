@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import (
     ColumnElement,
@@ -99,28 +99,37 @@ CHANGE = update(instances).where(
 EVENT = insert(events)
 
 
-def versions(*conditions: ColumnElement[bool]) -> Select[str, int]:
-    """Which instances, oldest first, and how often each was changed."""
-    found = select(instances.c.id, instances.c.version).where(*conditions)
-    return found.order_by(instances.c.created_at, instances.c.id)
+class Look(NamedTuple):
+    """For instances that are so at the moment when each statement is executed."""
+
+    versions: Select[str, int]
+    """Which, oldest first, and how often each was changed."""
+    whole: Select[Any]
+    """Those of these ids."""
+    changeable: Select[Any]
+    """The same without the manifest, which is the largest part and stays as it is."""
 
 
-WHOLE = select(instances).where(instances.c.id.in_(bindparam("ids", expanding=True)))
-CHANGEABLE = select(*(column for column in instances.c if column is not instances.c.manifest)).where(
-    instances.c.id.in_(bindparam("ids", expanding=True))
-)
-"""All but the manifest, which is the largest part and stays as it is."""
-EVERY = versions()
-ALL_LIVE = versions(LIVE)
-LIVE_OF = versions(LIVE, instances.c.robot == bindparam("robot"))
+def look(*conditions: ColumnElement[bool]) -> Look:
+    """How to look for instances."""
+    versions = select(instances.c.id, instances.c.version).where(*conditions)
+    some = (instances.c.id.in_(bindparam("ids", expanding=True)), *conditions)
+    return Look(
+        versions.order_by(instances.c.created_at, instances.c.id),
+        select(instances).where(*some),
+        select(*(column for column in instances.c if column is not instances.c.manifest)).where(*some),
+    )
+
+
+EVERY = look()
+ALL_LIVE = look(LIVE)
+LIVE_OF = look(LIVE, instances.c.robot == bindparam("robot"))
 COUNT_LIVE = select(func.count()).where(LIVE, instances.c.service == bindparam("service"))
-LIVE_AT = versions(LIVE, instances.c.site == bindparam("site"))
-CHANGING_AT = versions(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
-WAITING = versions(instances.c.state.in_([State.PENDING, State.PLACING]))
-LIVE_STANDBYS = versions(LIVE, instances.c.standby)
-STANDBYS = versions(
-    instances.c.standby, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING
-)
+LIVE_AT = look(LIVE, instances.c.site == bindparam("site"))
+CHANGING_AT = look(instances.c.state.in_([State.STARTING, State.STOPPING]), instances.c.site == bindparam("site"))
+WAITING = look(instances.c.state.in_([State.PENDING, State.PLACING]))
+LIVE_STANDBYS = look(LIVE, instances.c.standby)
+STANDBYS = look(instances.c.standby, instances.c.service == bindparam("service"), instances.c.state == State.RUNNING)
 
 
 def values(record: Record) -> dict[str, Any]:
@@ -137,7 +146,7 @@ def record(row: RowMapping) -> Record:
 
 
 def newer(seen: Record, row: RowMapping) -> Record:
-    """The record that was seen, as a row of `CHANGEABLE` has it now."""
+    """The record that was seen, as a row of `Look.changeable` has it now."""
     # By the fields' names: a column may have an older one.
     return seen.after({name: row[name] for name in COLUMNS if name != "manifest"})
 

@@ -15,7 +15,6 @@ from typing import Any
 from sqlalchemy import (
     ColumnElement,
     Connection,
-    Select,
     case,
     delete,
     exists,
@@ -452,22 +451,25 @@ class Store(GroupStore):
             connection.execute(delete(events).where(events.c.id <= (beyond or 0)))
         return gone
 
-    def _select(self, versions: Select[str, int], **named: str) -> list[Record]:
-        """Oldest first. Of those that have not changed since they were seen last, only the version is read."""
+    def _select(self, look: sql.Look, **named: str) -> list[Record]:
+        """Oldest first. Of those that have not changed since they were seen last, only the version is read.
+
+        One that was changed meanwhile is among them only if what is looked for is so still.
+        """
         with self._reader.connect() as connection:
-            rows = connection.execute(versions, named).all()
+            rows = connection.execute(look.versions, named).all()
             found = {id_: self._seen.get(id_) for id_, _ in rows}
             changed = [id_ for id_, version in rows if (seen := found[id_]) is None or seen.version != version]
             for start in range(0, len(changed), _FETCHED):
                 these = changed[start : start + _FETCHED]
                 known = {id_: seen for id_ in these if (seen := found[id_]) is not None}
+                found |= dict.fromkeys(these)
                 if known:
-                    rows_now = connection.execute(sql.CHANGEABLE, {"ids": list(known)}).mappings()
+                    rows_now = connection.execute(look.changeable, {**named, "ids": list(known)}).mappings()
                     found |= {row["id"]: sql.newer(known[row["id"]], row) for row in rows_now}
                 if new := [id_ for id_ in these if id_ not in known]:
-                    found |= {
-                        row["id"]: sql.record(row) for row in connection.execute(sql.WHOLE, {"ids": new}).mappings()
-                    }
+                    rows_now = connection.execute(look.whole, {**named, "ids": new}).mappings()
+                    found |= {row["id"]: sql.record(row) for row in rows_now}
         for id_ in changed:
             if (record := found[id_]) is not None:
                 self._remember(record)
