@@ -227,7 +227,7 @@ class Teller:
             raise
         self._watch.wrote(velocity, now)
         self._written.append(self._watch.told)
-        self._left_at = self._heard_at if self._sent and goes_on else now
+        self._left_at = self._heard_at if self._sent else now
         self._put(self._watch.told)
         return True
 

@@ -12,6 +12,7 @@ from ros1_graph import wait_for
 
 from skytether.guard.velocity import Velocity
 from skytether.messages import Bool, Joy, LaserScan, Twist, decode, encode, type_hash
+from skytether.robot.graphs.gate_io import WheelsTiming
 from skytether.robot.graphs.ros1.gate_io import Ros1Wheels
 from skytether.robot.graphs.ros1.kind import Ros1Way
 from skytether.robot.safety.client import GateError, ask
@@ -121,7 +122,7 @@ def test_a_velocity_that_waits_in_a_writer_that_stands_still_is_never_told(graph
     """It stands between two threads: the velocity is handed over, and not sent yet."""
     nodes, start = [], Node.start
     monkeypatch.setattr(Node, "start", lambda node: (nodes.append(node), start(node)))
-    wheels = Ros1Wheels(Ros1Way(master=graph.uri, cmd_vel="/told"), "guard", 0.1)
+    wheels = Ros1Wheels(Ros1Way(master=graph.uri, cmd_vel="/told"), "guard", WheelsTiming(0.1, 0.1, 0.1, 1.0))
     told = []
     listener = Listener(lambda data, _: told.append(decode(Twist, data, "ros1").linear.x))
     walker.node.subscribe("/told", Twist.TYPE, type_hash(Twist, "ros1"), listener)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import logging
+import socket
+import struct
+import termios
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 from math import inf
+from typing import NamedTuple
 
 from skytether.guard.clock import now as boottime
 from skytether.ros.names import ros1_type
@@ -28,11 +33,21 @@ _WRITTEN_BYTES = 2**16
 _HANDOVER = 1000
 """Messages on the way from other threads to the node's; they wait there for milliseconds."""
 _MAX_SUBSCRIBERS = 256
+_MOST_UNREAD = 4096
+"""Frames of which it is known when they were put."""
 
 
 Speaking = Callable[[], AbstractContextManager[None]]
-_Frame = tuple[bytes, float]
-"""What goes to subscribers, and when it is too old for that [s, as `boottime`]."""
+
+
+class _Frame(NamedTuple):
+    """What goes to subscribers."""
+
+    data: bytes
+    until: float = inf
+    """When it is too old for that [s, as `boottime`]."""
+    put_at: float = -inf
+    """When it was wanted, where it is to be known whether it got there [s]."""
 
 
 class _Subscriber:
@@ -52,19 +67,25 @@ class _Subscriber:
         self._clock = clock
         self._speaking = speaking
         self._limit = queue
+        self._written = 0
+        """Bytes that the connection was given."""
+        self._unread: deque[tuple[int, float]] = deque(maxlen=_MOST_UNREAD)
+        """Of those frames that have not got there, so far as is known: bytes to their ends, and when they were put."""
+        self.read_at = clock()
+        """When the last was put that the other computer has [s]; at first, since when it is there."""
         self._queue: deque[_Frame] = deque()
         self._bytes = 0
         self._draining: asyncio.Task[None] | None = None
         writer.transport.set_write_buffer_limits(_WRITTEN_BYTES)
 
-    def send(self, frame: bytes, until: float = inf) -> None:
+    def send(self, frame: _Frame) -> None:
         if self._draining is None and self.writer.transport.get_write_buffer_size() < _WRITTEN_BYTES:
-            self._write(frame, until)
+            self._write(frame)
             return
-        self._queue.append((frame, until))
-        self._bytes += len(frame)
+        self._queue.append(frame)
+        self._bytes += len(frame.data)
         while len(self._queue) > self._limit or (self._bytes > QUEUE_BYTES and len(self._queue) > 1):
-            self._bytes -= len(self._queue.popleft()[0])
+            self._bytes -= len(self._queue.popleft().data)
             self.dropped += 1
         if self._draining is None:
             self._draining = asyncio.ensure_future(self._drain())
@@ -74,26 +95,62 @@ class _Subscriber:
             while self._queue:
                 await self.writer.drain()
                 if self._queue:
-                    frame, until = self._queue.popleft()
-                    self._bytes -= len(frame)
-                    self._write(frame, until)
+                    frame = self._queue.popleft()
+                    self._bytes -= len(frame.data)
+                    self._write(frame)
         except OSError:
             self._queue.clear()  # the connection's reader notices its end
         finally:
             self._draining = None
 
-    def _write(self, frame: bytes, until: float) -> None:
+    def _write(self, frame: _Frame) -> None:
         """Right before it goes, for this process may have stood still since it was wanted."""
         with self._speaking():
-            if self._clock() <= until:
-                self.writer.write(frame)
+            if self._clock() <= frame.until:
+                self.writer.write(frame.data)
+                self._written += len(frame.data)
             else:
                 self.dropped += 1
+                return
+        if frame.put_at > -inf:
+            self._unread.append((self._written, frame.put_at))
+
+    def see_read(self) -> float:
+        """Ask the kernel what the other computer has acknowledged; from one thread, any.
+
+        Returns:
+            For how long the oldest frame that it has not is on its way [s]; 0: it has all.
+        """
+        read, transport = self._written, self.writer.transport
+        try:
+            read -= transport.get_write_buffer_size() + _unacknowledged(transport.get_extra_info("socket"))
+        except (OSError, ValueError):  # it has just ended
+            return 0.0
+        while self._unread and self._unread[0][0] <= read:
+            self.read_at = self._unread.popleft()[1]
+        try:
+            return max(0.0, self._clock() - self._unread[0][1])
+        except IndexError:
+            return 0.0
 
     def close(self) -> None:
         if self._draining is not None:
             self._draining.cancel()
         self.writer.close()
+
+
+def _unacknowledged(sock: socket.socket) -> int:
+    """Bytes in a TCP connection that the other end's kernel has not acknowledged, of Linux."""
+    return int(struct.unpack("i", fcntl.ioctl(sock.fileno(), termios.TIOCOUTQ, bytes(4)))[0])
+
+
+class Heard(NamedTuple):
+    """How far what is published has got."""
+
+    at: float
+    """When the last was put that the computers of all who listen have [s]."""
+    unread: tuple[str, ...]
+    """Who has not, for longer than he may."""
 
 
 class Publication:
@@ -148,6 +205,7 @@ class Publication:
         self._handover: deque[tuple[_Frame, int | None]] = deque(maxlen=_HANDOVER)
         self._subscribers: list[_Subscriber] = []
         self.renewed = 0
+        self._awaited = frozenset(awaited)
         self._comers, self._began = Comers(awaited), clock()
         self._refused: set[tuple[str, str]] = set()
 
@@ -168,7 +226,7 @@ class Publication:
         frame = pack_frame(payload)
         with self._lock:
             first = not self._handover
-            self._handover.append(((frame, until), renewed))
+            self._handover.append((_Frame(frame, until, self._clock() if until < inf else -inf), renewed))
         if first:
             self._soon(self._flush)
 
@@ -179,13 +237,13 @@ class Publication:
         if not frames:
             return
         if self._latched:
-            self._newest = frames[-1][0]
+            self._newest = frames[-1].data
         for subscriber in self._subscribers:
-            for frame, until in frames:
-                subscriber.send(frame, until)
+            for frame in frames:
+                subscriber.send(frame)
         if self._hold_s and not self._subscribers:
             held_until = time.monotonic() + self._hold_s
-            self._held.extend((held_until, frame) for frame, _ in frames)
+            self._held.extend((held_until, frame.data) for frame in frames)
 
     async def serve(self, header: dict[str, str], reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """In the node's thread: a subscriber has connected. Returns when it is gone."""
@@ -198,11 +256,11 @@ class Publication:
         writer.write(self._header)
         subscriber = _Subscriber(caller, writer, self._queue, self._clock, self._speaking)
         if self._latched and self._newest is not None:
-            subscriber.send(self._newest)
+            subscriber.send(_Frame(self._newest))
         while self._held:
             until, frame = self._held.popleft()
             if time.monotonic() < until:
-                subscriber.send(frame)
+                subscriber.send(_Frame(frame))
         self._subscribers.append(subscriber)
         self.renewed += self._is_anybody_back()
         try:
@@ -212,6 +270,15 @@ class Publication:
             self._subscribers.remove(subscriber)
             self._is_anybody_back()
             subscriber.close()
+
+    def heard(self, patience_s: float) -> Heard | None:
+        """How far what was published with ``until`` has got; from one thread, any.
+
+        Of those it is for: if they are not known, of all who listen; None: of those nobody does.
+        """
+        there = [one for one in list(self._subscribers) if not self._awaited or one.caller in self._awaited]
+        unread = tuple(one.caller for one in there if one.see_read() > patience_s)
+        return Heard(min(one.read_at for one in there), unread) if there else None
 
     def _is_anybody_back(self) -> bool:
         there = {each: each.caller for each in self._subscribers}

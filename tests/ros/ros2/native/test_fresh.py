@@ -51,7 +51,7 @@ def fresh(monkeypatch):
 def test_who_hangs_has_acknowledged_nothing_though_dds_lets_go_of_it(fresh, gap_s):
     wheels, number = Wheels(), 0
     publisher = fresh.FreshPublisher(
-        None, wheels, LIFESPAN_S, lambda: 1, [], contextlib.nullcontext, lambda: wheels.now
+        Mock(), wheels, LIFESPAN_S, lambda: 1, [], contextlib.nullcontext, lambda: wheels.now
     )
 
     def publish(times):

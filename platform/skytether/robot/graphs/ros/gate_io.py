@@ -7,7 +7,6 @@ from collections.abc import Collection, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from skytether.control.admittance import Velocity
-from skytether.guard.teller import Sent
 from skytether.messages import Message, Twist, Vector3
 
 from ..inbox import Inbox
@@ -72,10 +71,6 @@ class RosWheels(RosGateNode[Node]):
     def full(self) -> bool:
         """Wheels: never; what nobody takes in time is thrown away."""
         return False
-
-    def sent(self) -> Sent | None:
-        """Wheels: nobody else sends it."""
-        return None
 
     @property
     def others(self) -> Others:

@@ -14,13 +14,16 @@ from math import inf
 from skytether.control.admittance import Velocity
 from skytether.guard.board import Place
 from skytether.guard.clock import now as boottime
+from skytether.guard.teller import Sent
 from skytether.messages import Bool, MarkerArray, Message, Twist, encode, hash_of
 from skytether.robot.graphs.wheels_watch import WheelsWatch
 from skytether.ros.names import resolve
 from skytether.ros.ros1.node import Node, NodeError
+from skytether.ros.ros1.publication import Heard
 from skytether.ros.ros1.subscription import Listener
 from skytether.ros.ros2.native.side.speaking import Speaking
 
+from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
 from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
 from .sections import Ros1Way
@@ -32,8 +35,8 @@ class Ros1Wheels(RosWheels[Node]):
     Args:
         way: Where it is.
         role: Ends the node's name: ``guard`` for the writer, or ``gate``.
-        fresh_s: Nobody gets a velocity or a level that is older [s]: it is the node's own thread that sends them, and
-            this process may stand still meanwhile.
+        timing: Nobody gets a velocity or a level that is older than `WheelsTiming.fresh_s`: it is the node's own thread
+            that sends them, and this process may stand still meanwhile.
         enable_topic: Of the enable signal, std_msgs/Bool; empty: there is none.
         place: Where that thread says that it is about to send one.
 
@@ -42,9 +45,11 @@ class Ros1Wheels(RosWheels[Node]):
     """
 
     def __init__(
-        self, way: Ros1Way, role: str, fresh_s: float, enable_topic: str = "", place: Place | None = None
+        self, way: Ros1Way, role: str, timing: WheelsTiming, enable_topic: str = "", place: Place | None = None
     ) -> None:
-        self._fresh_s = fresh_s
+        self._fresh_s = timing.fresh_s
+        self._patience_s = timing.guard_s if way.need_acknowledgements else inf
+        self._heard: Heard | None = None
         super().__init__(_start(way, role))
         topic = resolve(way.cmd_vel, way.namespace)
         speaking = Speaking(*place) if place else nullcontext
@@ -72,9 +77,19 @@ class Ros1Wheels(RosWheels[Node]):
         if self._enable is not None:
             self._enable.publish(encode(Bool(data=level), "ros1"), boottime() + self._fresh_s)
 
+    def sent(self) -> Sent | None:
+        """Wheels: what those who listen have, as far as their computers acknowledge it: a program of them may hang."""
+        if self._patience_s == inf:
+            return None
+        self._heard = self._publication.heard(self._patience_s)
+        return Sent(self._heard.at, self._heard.at) if self._heard else None
+
     def unread(self) -> str:
-        """Wheels: not known; nothing is acknowledged."""
-        return ""
+        """Wheels: whose computers do not acknowledge."""
+        if self._heard is None or not self._heard.unread:
+            return ""
+        topic, names = self._publication.topic, " or ".join(sorted({*self._heard.unread}))
+        return f"{topic} is not acknowledged by {names}; they are braked until it is"
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, of those that turn the wheels."""

@@ -83,7 +83,7 @@ class Ros1(GraphKind[Ros1Config, Ros1Way]):
     ) -> Wheels:
         from .gate_io import Ros1Wheels
 
-        return Ros1Wheels(way, role, timing.fresh_s, enable_topic, place)
+        return Ros1Wheels(way, role, timing, enable_topic, place)
 
     def open_display(self, way: Ros1Way, topic: str) -> Display:
         from .gate_io import Ros1Display

@@ -36,6 +36,10 @@ class Ros1Config(RobotSection, Ros1Link):
 class Ros1Way(GateSection, Ros1Link):
     """A robot that is a ROS 1 graph: names are absolute, or in ``namespace``."""
 
+    need_acknowledgements: bool = True
+    """Whether the wheels are braked while the computer of somebody who listens to the velocities does not acknowledge
+    them; false where others listen over a network that is too bad for that."""
+
     @field_validator("namespace", "node", "cmd_vel")
     @classmethod
     def _a_name(cls, name: str) -> str:

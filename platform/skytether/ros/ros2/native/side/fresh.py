@@ -57,6 +57,7 @@ class FreshPublisher:
         self._lock = threading.Lock()
         """Of what is known of who hears, and was published."""
         self._nodes = partial(graph.listeners, node, publisher.topic_name)
+        self._shown = partial(node.count_subscribers, publisher.topic_name)
         self._came = came
         self._published, self._published_at = 0, now()
         self._number = self._newest = self._read = self._heard = 0
@@ -85,16 +86,19 @@ class FreshPublisher:
         hearing, publisher, now = self._hearing, self._publisher, self._now()
         with self._lock:
             self._see_read()
-            came, there = self._came(), self._nodes()
-            hearing.update(publisher.get_subscription_count(), came, self._read == self._newest, now, there)
+            shown, came, there = self._shown(), self._came(), self._nodes()
+            listeners = publisher.get_subscription_count()
+            hearing.update(listeners, came, self._read == self._newest, now, there)
             if not hearing.unread_s:
                 self._heard = self._newest
         with self._speaking():
             known = renewed in (FOR_ALL, FIRST_WORD) or (
                 renewed == hearing.renewed
                 and not hearing.holds
-                and came == self._came()
                 and there.keys() == self._nodes().keys()  # DDS shows who comes, connects him, and then counts that
+                and came == self._came()
+                and shown == self._shown()  # to name them takes as long as some milliseconds, to count them none
+                and listeners == publisher.get_subscription_count()
             )
             new = bool(known and self._now() <= until)
             if new:
