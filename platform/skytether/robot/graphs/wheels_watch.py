@@ -39,7 +39,12 @@ NOBODY = Others()
 
 @runtime_checkable
 class WatchesWheels(Protocol):
-    """A graph that knows who else tells the wheels."""
+    """A graph that knows who else tells the wheels, and whom it cannot tell anything."""
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """Why somebody who listens hears nothing: sentences; from any thread, and without waiting."""
+        ...
 
     @property
     def others(self) -> Others:

@@ -71,6 +71,7 @@ class _Subscriber:
         """Bytes that the connection was given."""
         self._unread: deque[tuple[int, float]] = deque(maxlen=_MOST_UNREAD)
         """Of those frames that have not got there, so far as is known: bytes to their ends, and when they were put."""
+        self._forgets = False
         self.read_at = clock()
         """When the last was put that the other computer has [s]; at first, since when it is there."""
         self._queue: deque[_Frame] = deque()
@@ -113,6 +114,11 @@ class _Subscriber:
                 self.dropped += 1
                 return
         if frame.put_at > -inf:
+            if not self._forgets:
+                # What has not got there by the end of this process, is not sent again after it.
+                sock = self.writer.get_extra_info("socket")
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                self._forgets = True
             self._unread.append((self._written, frame.put_at))
 
     def see_read(self) -> float:

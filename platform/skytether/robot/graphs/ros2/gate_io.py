@@ -120,6 +120,11 @@ class Ros2Wheels(RosWheels[GraphNode]):
         lost = stuck or publication.lost
         return Sent(publication.left_at, heard_at, lost, stuck, unheard=acknowledged and not publication.heard)
 
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """WatchesWheels: of the node; a subscription that asks for more than we offer is among them."""
+        return self._node.troubles
+
     def _publishers(self) -> list[str]:
         return [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.PUBLISHER)]
 

@@ -232,7 +232,8 @@ class GateLoop:
         last, answer = self._last, self._heartbeat.answer
         told = self._heartbeat.told(self._clock()).velocity
         feed = self._feed.trouble if self._feed is not None else ""
-        more = [sentence for sentence in (feed, self._other_publishers) if sentence]
+        of_wheels = self._watched.troubles if self._watched is not None else ()
+        more = [sentence for sentence in (feed, self._other_publishers, *of_wheels) if sentence]
         return {
             "stopped": self._stopped,
             "kept": answer.kept if answer else None,
