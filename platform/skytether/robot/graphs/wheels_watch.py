@@ -39,16 +39,21 @@ NOBODY = Others()
 
 @runtime_checkable
 class WatchesWheels(Protocol):
-    """A graph that knows who else tells the wheels, and whom it cannot tell anything."""
-
-    @property
-    def troubles(self) -> tuple[str, ...]:
-        """Why somebody who listens hears nothing: sentences; from any thread, and without waiting."""
-        ...
+    """A graph that knows who else tells the wheels."""
 
     @property
     def others(self) -> Others:
         """From any thread; never waits."""
+        ...
+
+
+@runtime_checkable
+class KnowsTheDeaf(Protocol):
+    """A graph that knows who listens to the velocities and is told none."""
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """Why: sentences; from any thread, and without waiting."""
         ...
 
 

@@ -77,11 +77,6 @@ class RosWheels(RosGateNode[Node]):
         """WatchesWheels: who else publishes the topic; the gate's own looks for that."""
         return self._watch.others if self._watch is not None else NOBODY
 
-    @property
-    def troubles(self) -> tuple[str, ...]:
-        """WatchesWheels: on ROS 1 whoever connects hears."""
-        return ()
-
     def close(self) -> None:
         """Leave the graph."""
         if self._watch is not None:

@@ -122,7 +122,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """WatchesWheels: of the node; a subscription that asks for more than we offer is among them."""
+        """KnowsTheDeaf: of the node; a subscription that asks for more than we offer is among them."""
         return self._node.troubles
 
     def _publishers(self) -> list[str]:

@@ -32,7 +32,7 @@ from skytether.guard.requests import Requests
 from skytether.guard.settings import thaw
 from skytether.guard.velocity import STANDSTILL
 from skytether.messages import Twist, TwistStamped, warm
-from skytether.robot.graphs.wheels_watch import NOBODY, Others, WatchesWheels
+from skytether.robot.graphs.wheels_watch import NOBODY, KnowsTheDeaf, Others, WatchesWheels
 from skytether.robot.graphs.wheels_watch import sentence as sentence_of_others
 from skytether.robot.log_throttle import LogThrottle
 
@@ -232,7 +232,7 @@ class GateLoop:
         last, answer = self._last, self._heartbeat.answer
         told = self._heartbeat.told(self._clock()).velocity
         feed = self._feed.trouble if self._feed is not None else ""
-        of_wheels = self._watched.troubles if self._watched is not None else ()
+        of_wheels = self._wheels.troubles if isinstance(self._wheels, KnowsTheDeaf) else ()
         more = [sentence for sentence in (feed, self._other_publishers, *of_wheels) if sentence]
         return {
             "stopped": self._stopped,
