@@ -27,7 +27,7 @@ import pytest
 
 from skytether.api.service_report import MOST_BYTES
 from skytether.api.splice import closed, splice
-from skytether.node.archives import misleads
+from skytether.node.archives import leads_straight, misleads
 from skytether.node.cgroups import Cgroups
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
@@ -1511,3 +1511,19 @@ def test_what_is_refused_is_told_and_the_engine_hears_nothing_of_it(engine: Engi
 def test_an_engine_that_does_not_answer_is_told_apart_from_a_refusal(engine: Engine) -> None:
     engine.ended = True
     assert b"503 Service Unavailable" in say(engine, request(f"POST /containers/{ID}/start"))
+
+
+@pytest.mark.parametrize(
+    ("leads", "straight"),
+    [("usr/sbin", True), ("/usr/sbin", True), ("/v/y", False), ("v/../usr/sbin", False), ("//usr/sbin", False)],
+)
+def test_of_the_link_to_the_engines_first_process_its_own_words_count(leads: str, straight: bool) -> None:
+    """An engine tells where it ends: by way of a link in a volume's place, it ends elsewhere when that is mounted."""
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w") as made:
+        entry = tarfile.TarInfo("sbin")
+        entry.type, entry.linkname = tarfile.SYMTYPE, leads
+        made.addfile(entry)
+    assert leads_straight(packed.getvalue(), "/usr/sbin") is straight
+    assert not leads_straight(b"", "/usr/sbin")
+    assert not leads_straight(bytes(1024), "/usr/sbin")

@@ -164,3 +164,18 @@ def misleads(path: str, stat: Mapping[str, Any]) -> bool:
     if path == _SBIN and stat["linkTarget"] in _SBINS:
         return False
     return bool(stat["mode"] & _LINK)
+
+
+def must_be_read(path: str, stat: Mapping[str, Any]) -> bool:
+    """Whether it is a link whose own words count, see `leads_straight`: an engine tells only where it ends."""
+    return path == _SBIN and bool(stat["mode"] & _LINK)
+
+
+def leads_straight(archive: bytes, end: str) -> bool:
+    """Whether a link, as an engine packs it, leads to its end by no other link: that could lead through a volume."""
+    try:
+        with tarfile.open(fileobj=io.BytesIO(archive), mode="r:") as tar:
+            link = tar.next()
+    except (tarfile.TarError, OSError, ValueError):
+        return False
+    return link is not None and link.issym() and link.linkname in (end, end.removeprefix("/"))

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from http import HTTPStatus
 from urllib.parse import urlencode
 
-from .archives import misleads, pull_stat
+from .archives import leads_straight, misleads, must_be_read, pull_stat
 from .engine_rules import LOOK, NOBODY, OWNER
 from .machine import ask_long
 from .removals import begun
@@ -106,4 +106,9 @@ class Images:
         stat = pull_stat(answer.headers)
         if stat is None:
             raise ValueError(f"its engine says nothing of {path}")
-        return misleads(path, stat)
+        if misleads(path, stat):
+            return True
+        if not must_be_read(path, stat):
+            return False
+        link = await ask_long(self._engine, asks, method="GET")
+        return link.status != HTTPStatus.OK or not leads_straight(link.content, stat["linkTarget"])
