@@ -44,6 +44,8 @@ def test_a_row_that_keeps_more_is_given_more():
         (RELIABLE, LATCHED, "transient local is asked for, volatile is offered"),
         (RELIABLE, Qos(deadline_s=0.1), "a deadline of 0.1 s is asked for, none is offered"),
         (Qos(deadline_s=0.5), Qos(deadline_s=0.1), "a deadline of 0.1 s is asked for, 0.5 s is offered"),
+        (RELIABLE, Qos(lease_s=0.5), "a lease of liveliness of 0.5 s is asked for, none is offered"),
+        (Qos(lease_s=0.5), Qos(lease_s=0.5), ""),
         (RELIABLE, Qos(manual=True), "liveliness by hand is asked for, automatic liveliness is offered"),
         (Qos(False), LATCHED, "reliable is asked for, best effort is offered, transient local is asked for, volatile"),
         (LATCHED, RELIABLE, ""),

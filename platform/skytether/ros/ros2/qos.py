@@ -23,6 +23,7 @@ class Qos:
         depth: Messages kept; of a history that keeps all, as many as a topic of the bridge may. 0: nobody told.
         deadline_s: At most so long between two messages; None: nobody asks for that.
         manual: Liveliness is told by hand, topic by topic.
+        lease_s: At most so long between two signs of life; None: nobody asks for that.
     """
 
     reliable: bool = True
@@ -30,6 +31,7 @@ class Qos:
     depth: int = DEFAULT_DEPTH
     deadline_s: float | None = None
     manual: bool = False
+    lease_s: float | None = None
 
 
 _ACTION_STATUS = "/_action/status"
@@ -79,9 +81,12 @@ def clash(offered: Qos, asked: Qos) -> str:
         found.append(("reliable", "best effort"))
     if asked.transient_local and not offered.transient_local:
         found.append(("transient local", "volatile"))
-    if asked.deadline_s is not None and (offered.deadline_s is None or offered.deadline_s > asked.deadline_s):
-        offer = "none" if offered.deadline_s is None else f"{offered.deadline_s:g} s"
-        found.append((f"a deadline of {asked.deadline_s:g} s", offer))
+    for what, want, have in (
+        ("deadline", asked.deadline_s, offered.deadline_s),
+        ("lease of liveliness", asked.lease_s, offered.lease_s),
+    ):
+        if want is not None and (have is None or have > want):
+            found.append((f"a {what} of {want:g} s", "none" if have is None else f"{have:g} s"))
     if asked.manual and not offered.manual:
         found.append(("liveliness by hand", "automatic liveliness"))
     return ", ".join(f"{want} is asked for, {have} is offered" for want, have in found)

@@ -393,8 +393,9 @@ def clashes(ours: Endpoint, others: Sequence[Endpoint]) -> list[str]:
 
 
 def _endpoint(row: list[Any]) -> Endpoint:
-    _, kind, name, type_name, type_hash, node, reliable, transient_local, depth, deadline, manual, *parts = row
-    qos = Qos(reliable, transient_local, depth, deadline, manual)
+    _, kind, name, type_name, type_hash, node, reliable, transient_local, depth, *more = row
+    deadline, manual, lease, *parts = more
+    qos = Qos(reliable, transient_local, depth, deadline, manual, lease)
     return Endpoint(Kind(kind), name, type_name, type_hash, qos, node, parts=(parts[0], parts[1]))
 
 

@@ -13,6 +13,8 @@ _KEPT = 10_000
 """What a history that keeps all is told as."""
 _ENDLESS = 1e9
 """Seconds; what is longer is no deadline."""
+_OF_SERVICES = (True, False, 10, None, False, None)
+"""Quality, of each."""
 
 
 def profile(reliable: bool, transient_local: bool, depth: int, lifespan_s: float | None = None) -> QoSProfile:
@@ -31,8 +33,8 @@ def list_endpoints(node: Any, names: list[str] | None) -> list[list[Any]]:
     """Endpoints of other nodes, sorted.
 
     Each is a list: its id, which is another after it was away; kind; name; type; type hash or nothing; node; reliable;
-    transient local; depth, 0 if it is not told; deadline in seconds or nothing; liveliness by hand; of a service the
-    hashes of request and response.
+    transient local; depth, 0 if it is not told; deadline in seconds or nothing; liveliness by hand; its lease in
+    seconds or nothing; of a service the hashes of request and response.
 
     Args:
         node: Ours.
@@ -74,7 +76,7 @@ def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]
             ("", "", "", "")
         ]
         found += [
-            [f"{gid}{name} {kind}", SERVER, name, kind, "", where, True, False, 10, None, False, request, response]
+            [f"{gid}{name} {kind}", SERVER, name, kind, "", where, *_OF_SERVICES, request, response]
             for kind in kinds
             for gid, where, request, response in seen
         ]
@@ -82,9 +84,7 @@ def list_services(node: Any, ours: set[str], asked: set[str]) -> list[list[Any]]
         for info in node.get_publishers_info_by_topic(f"rq{name}Request", no_mangle=True):
             kind = info.topic_type.replace("::dds_::", "/").replace("::", "/").removesuffix("_Request_")
             if (info.node_name, info.node_namespace) != own:
-                found.append(
-                    [_gid(info), CLIENT, name, kind, "", _node(info), True, False, 10, None, False, _hash(info), ""]
-                )
+                found.append([_gid(info), CLIENT, name, kind, "", _node(info), *_OF_SERVICES, _hash(info), ""])
     return sorted(found, key=lambda endpoint: str(endpoint[0]))
 
 
@@ -102,7 +102,10 @@ def others(node: Any) -> tuple[int, int]:
 
 def _endpoint(kind: str, name: str, info: Any) -> list[Any]:
     qos = info.qos_profile
-    deadline = _seconds(qos.deadline)
+    deadline, lease = (
+        seconds if 0 < seconds < _ENDLESS else None
+        for seconds in map(_seconds, (qos.deadline, qos.liveliness_lease_duration))
+    )
     return [
         _gid(info),
         kind,
@@ -113,8 +116,9 @@ def _endpoint(kind: str, name: str, info: Any) -> list[Any]:
         qos.reliability == ReliabilityPolicy.RELIABLE,
         qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
         _KEPT if qos.history == HistoryPolicy.KEEP_ALL else int(qos.depth),
-        deadline if 0 < deadline < _ENDLESS else None,
+        deadline,
         qos.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC,
+        lease,
         "",
         "",
     ]
