@@ -47,38 +47,6 @@ def test_of_the_second_version_each_group_says_it_with_those_below(tmp_path):
     assert found.of_docker() == {ONE, OTHER}
 
 
-SHIM = "/usr/bin/containerd-shim-runc-v2\0-namespace\0moby\0-id\0{}\0"
-
-
-def process(proc, pid, parent, *, first=1, state="S", program="", at="/system.slice/docker.service"):
-    folder = proc / str(pid)
-    folder.mkdir(parents=True)
-    (folder / "status").write_text(f"Name:\tx\nState:\t{state} (x)\nPPid:\t{parent}\nNSpid:\t{pid}\t{first}\n")
-    (folder / "cmdline").write_text(program)
-    (folder / "cgroup").write_text(f"4:pids:{at}\n0::{at}\n")
-
-
-@pytest.mark.parametrize(
-    ("first", "shim", "kept"),
-    [
-        ({}, {}, True),
-        ({"state": "Z"}, {}, False),
-        ({"first": 3}, {}, False),
-        ({}, {"program": "/usr/bin/sleep\x0060\0"}, False),
-        ({}, {"program": SHIM.format(OTHER)}, False),
-        ({}, {"at": f"/docker/{ONE}"}, False),
-        ({}, {"at": f"/system.slice/docker-{ONE}.scope"}, False),
-    ],
-)
-def test_what_another_engine_has_is_kept_by_a_program_outside(root, tmp_path, first, shim, kept):
-    proc = tmp_path / "proc"
-    (root / "pids" / "docker" / ONE / "cgroup.procs").write_text("7\n")
-    assert not Cgroups(root, proc).is_kept(ONE), "the process has ended meanwhile"
-    process(proc, 7, 5, **first)
-    process(proc, 5, 1, **{"program": SHIM.format(ONE), **shim})
-    assert Cgroups(root, proc).is_kept(ONE) is kept
-
-
 def test_what_is_in_the_group_of_a_container_is_none_of_its_own(root):
     group(root / "pids" / "docker" / ONE / "docker" / ("6" * 64), lives=True)
     assert Cgroups(root).of_docker() == {ONE, OTHER, OLD}

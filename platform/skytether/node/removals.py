@@ -405,9 +405,7 @@ class Removals:
         cgroups = await asyncio.to_thread(Cgroups)
         found = {one for one in known if one not in but and cgroups.go_on(one)}
         for container in cgroups.of_docker():
-            if container in known or container in but or not cgroups.go_on(container):
-                continue
-            if not await asyncio.to_thread(cgroups.is_kept, container):
+            if container not in known and container not in but and cgroups.go_on(container):
                 gone = True
                 with contextlib.suppress(OSError, ValueError):  # who says nothing says not that it knows it
                     path = f"/containers/{container}/json"
