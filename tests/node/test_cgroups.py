@@ -47,9 +47,11 @@ def test_of_the_second_version_each_group_says_it_with_those_below(tmp_path):
     assert found.of_docker() == {ONE, OTHER}
 
 
-def test_what_is_in_the_group_of_a_container_is_none_of_its_own(root):
-    group(root / "pids" / "docker" / ONE / "docker" / ("6" * 64), lives=True)
-    assert Cgroups(root).of_docker() == {ONE, OTHER, OLD}
+def test_an_engine_that_is_in_a_container_itself_has_its_own_below_it(root):
+    inner = "6" * 64
+    group(root / "pids" / "docker" / ONE / "docker" / inner, lives=True)
+    assert Cgroups(root).of_docker() == {ONE, OTHER, OLD, inner}
+    assert Cgroups(root).go_on(inner)
 
 
 def test_where_there_are_no_groups_nobody_is_known_to_go_on(tmp_path):

@@ -21,8 +21,6 @@ _PARENTS = {"docker", ""}
 class Cgroups:
     """The groups of all containers, as they were when this was made.
 
-    What is in a container's group belongs to it: a container of an engine that runs in there, for one.
-
     Args:
         root: Of the file system.
 
@@ -52,10 +50,9 @@ class Cgroups:
 def _found(top: Path) -> dict[str, dict[Path, bool]]:
     """Containers, and their groups: of each, whether it may be of Docker."""
     found: dict[str, dict[Path, bool]] = {}
-    for folder, below, _ in os.walk(top, onerror=_must_be_listed):
+    for folder, _, _ in os.walk(top, onerror=_must_be_listed):
         path = Path(folder)
         if named := _NAME.fullmatch(path.name):
-            below.clear()
             parent = "" if path.parent == top else path.parent.name
             found.setdefault(named[2], {})[path] = bool(named[1]) or (path.name == named[2] and parent in _PARENTS)
     return found

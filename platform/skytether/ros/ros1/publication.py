@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from math import inf
 from typing import NamedTuple
 
@@ -72,6 +72,7 @@ class _Subscriber:
         self._unread: deque[tuple[int, float]] = deque(maxlen=_MOST_UNREAD)
         """Of those frames that have not got there, so far as is known: bytes to their ends, and when they were put."""
         self._forgets = False
+        """Whether the kernel gives up what is on its way when the connection is closed."""
         self.read_at = clock()
         """When the last was put that the other computer has [s]; at first, since when it is there."""
         self._queue: deque[_Frame] = deque()
@@ -115,9 +116,10 @@ class _Subscriber:
                 return
         if frame.put_at > -inf:
             if not self._forgets:
-                # What has not got there by the end of this process, is not sent again after it.
+                # What has not got there by the end of this process is not sent again after it.
                 sock = self.writer.get_extra_info("socket")
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                with suppress(OSError):  # the connection has just ended, and others wait for the frame
+                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self._forgets = True
             self._unread.append((self._written, frame.put_at))
 

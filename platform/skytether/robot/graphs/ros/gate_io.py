@@ -27,6 +27,11 @@ def twist_of(velocity: Velocity) -> Twist:
     return Twist(linear=Vector3(x=velocity.linear), angular=Vector3(z=velocity.angular))
 
 
+def not_acknowledged(topic: str, names: Iterable[str]) -> str:
+    """What is said of those who listen to the wheels' topic and do not acknowledge it."""
+    return f"{topic} is not acknowledged by {' or '.join(sorted({*names}))}; they are braked until it is"
+
+
 class RosGateNode(Generic[Node]):
     """A node of the gate's own.
 

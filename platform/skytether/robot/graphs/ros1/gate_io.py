@@ -25,7 +25,7 @@ from skytether.ros.ros2.native.side.speaking import Speaking
 
 from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
-from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
+from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, twist_of
 from .sections import Ros1Way
 
 
@@ -88,8 +88,7 @@ class Ros1Wheels(RosWheels[Node]):
         """Wheels: whose computers do not acknowledge."""
         if self._heard is None or not self._heard.unread:
             return ""
-        topic, names = self._publication.topic, " or ".join(sorted({*self._heard.unread}))
-        return f"{topic} is not acknowledged by {names}; they are braked until it is"
+        return not_acknowledged(self._publication.topic, self._heard.unread)
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, of those that turn the wheels."""

@@ -26,7 +26,7 @@ from skytether.ros.ros2.sim_time import GraphClock
 
 from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
-from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, twist_of
+from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, twist_of
 from .sections import Ros2Way
 
 _STOPS = 10_000
@@ -91,8 +91,8 @@ class Ros2Wheels(RosWheels[GraphNode]):
         """Wheels: who listens, if not all of them acknowledge; the middleware does not tell who it is."""
         if self._publication.unread_s <= self._patience_s:
             return ""
-        names = sorted({endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.SUBSCRIPTION)})
-        return f"{self._topic} is not acknowledged by {' or '.join(names)}; they are braked until it is"
+        there = self._node.endpoints(self._topic, Kind.SUBSCRIPTION)
+        return not_acknowledged(self._topic, (endpoint.node for endpoint in there))
 
     def listeners(self) -> frozenset[str]:
         """Wheels: the nodes that listen, of those that turn the wheels; none while they cannot be told anything."""
