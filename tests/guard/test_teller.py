@@ -162,6 +162,29 @@ def test_who_begins_at_a_standstill_goes_on_within_patience_of_what_was_heard(bo
     assert first.wheels.untils[-1] == pytest.approx(2.1 + FRESH * PERIOD)
 
 
+def test_what_is_acknowledged_too_late_to_go_on_is_followed_by_a_standstill(both):
+    """A network kept for 0.15 s what goes on from before: the wheels stood, and heard full speed from then on."""
+    first, _ = both
+    first.wheels.held = Sent(0.8, 0.8)
+    for i in range(20):
+        first.turn(0.8 + i * PERIOD, FAST)
+        first.wheels.held = Sent(0.8 + i * PERIOD, 0.8 + i * PERIOD)
+    moving, heard_at = first.wheels.told[-1], 0.8 + 18 * PERIOD
+    first.wheels.held = Sent(heard_at, heard_at)
+    for at in (1.20, 1.22, 1.24):
+        assert first.turn(at, FAST)
+    assert first.wheels.told[-1].linear >= moving.linear > 0.3
+    first.wheels.held = Sent(1.24, 1.24)
+    assert not any(first.turn(at, FAST) for at in (1.31, 1.33)), "they have heard nothing for 0.15 s"
+    assert first.turn(1.35, FAST)
+    assert first.wheels.told[-1] == STANDSTILL
+    first.wheels.held = Sent(1.35, 1.35)
+    for i in range(1, 6):
+        assert first.turn(1.35 + i * PERIOD, FAST)
+        first.wheels.held = Sent(1.35 + i * PERIOD, 1.35 + i * PERIOD)
+    assert first.wheels.told[-1].linear == pytest.approx(1.0 * 5 * PERIOD), "what began at a standstill counts"
+
+
 def test_of_a_first_step_that_nobody_heard_nothing_more_is_told(both):
     first, _ = both
     first.wheels.held = Sent(-inf, -inf)

@@ -177,13 +177,13 @@ def far_nodes(ros2_nodes: Ros2Nodes) -> Iterator[Ros2Nodes]:
         nodes.close()
 
 
-def until(condition: Callable[[], object], what: str = "it", limit_s: float = LIMIT_S) -> None:
-    """Wait until something is so."""
+def until(condition: Callable[[], object], what: str = "it", limit_s: float = LIMIT_S, each_s: float = 0.01) -> None:
+    """Wait until something is so; looked at again and again, so long after each look."""
     deadline = time.monotonic() + limit_s
     while not condition():
         if time.monotonic() > deadline:
             raise AssertionError(f"waited {limit_s:g} s for {what}")
-        time.sleep(0.01)
+        time.sleep(each_s)
 
 
 def steady(read: Callable[[], _T], for_s: float = 0.5, limit_s: float = LIMIT_S) -> _T:

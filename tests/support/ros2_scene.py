@@ -100,8 +100,10 @@ class Agent:
     """``skytether robot run`` in the robots' network, and what it says of itself."""
 
     def __init__(self, scene: Scene, path: Path, port: int) -> None:
-        self._scene, self._path, self._port = scene, path, port
+        self._scene, self._path = scene, path
         self._log = path.with_suffix(".log")
+        # One for all questions: each new one would read the certificates of the machine again.
+        self._http = httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False)
         self.process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -165,7 +167,7 @@ class Agent:
 
     def _get(self, page: str) -> str:
         def inside() -> str:
-            return httpx.get(f"http://127.0.0.1:{self._port}/{page}", trust_env=False).text
+            return self._http.get(f"/{page}").text
 
         try:
             return self._scene.link.robot.run(inside)
@@ -173,6 +175,7 @@ class Agent:
             return ""
 
     def close(self) -> None:
+        self._http.close()
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             try:

@@ -83,9 +83,9 @@ class Localizer(Node):
     def _anchor(self, told: Odometry) -> None:
         then = nanoseconds(told)
         self._diary.note("odom", then)
-        since = [sample for sample in self._wheels if sample[0] >= then]
-        if not since:
+        if not self._wheels:
             return
+        since = [sample for sample in self._wheels if sample[0] >= then]
         pose = told.pose.pose
         found = pose.position.x, pose.position.y, 2 * math.atan2(pose.orientation.z, pose.orientation.w)
         for before, after in itertools.pairwise(since):

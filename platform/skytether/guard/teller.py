@@ -151,7 +151,7 @@ class Teller:
         self._broken_at = nan
         self._full_at = nan
         self._own, self._claim, self._left_at = board.of(role)  # of who had the role before
-        self._heard_at = -inf
+        self._heard_at = board.newest().left_at
         """As `board.Entry.left_at`, of whoever told the wheels something last."""
 
     def refresh(self, now: float) -> None:
@@ -161,7 +161,7 @@ class Teller:
             now: [s]
         """
         before, self._sent = self._sent, self._wheels.sent()
-        self._see_left()
+        self._see_left(now)
         newest = self._board.newest()
         if (self._sent and self._sent.lost) or (before and before.lost):
             self._watch.told = newest.told  # what was learned may have been taken back
@@ -277,12 +277,14 @@ class Teller:
     def _is_stuck(self) -> bool:
         return self._sent is not None and self._sent.stuck
 
-    def _see_left(self) -> None:
+    def _see_left(self, now: float) -> None:
         """What was written after what left, the wheels may not have been told; or never are: it is too old by then."""
         sent = self._sent
         if sent is None:
             return
-        self._left_at = max(self._left_at, min(sent.heard_at, self._own.at))
+        heard_at = min(sent.heard_at, self._own.at)
+        if self._in_time(heard_at, now):
+            self._left_at = max(self._left_at, heard_at)
         if not sent.lost:
             return
         while self._written and self._written[-1].at > sent.left_at:
@@ -291,6 +293,15 @@ class Teller:
             told = self._written[-1] if self._written else LastCommand()
             self._left_at = min(self._left_at, told.at)
             self._put(told)
+
+    def _in_time(self, heard_at: float, now: float) -> bool:
+        """Whether the wheels still turned by what they had heard before, as they heard what was written then.
+
+        A network may deliver late what goes on from before, and so may a connection that sends it again. What was
+        written later than the wheels' patience allows to go on began at a standstill.
+        """
+        latest = self._heard_at + self._watch.patience_s
+        return now <= latest or (heard_at > latest and now - heard_at <= self._watch.patience_s)
 
     def _failed(self, now: float) -> None:
         self._watch.failed(now)
