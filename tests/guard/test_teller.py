@@ -3,6 +3,7 @@
 import mmap
 import os
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -509,6 +510,63 @@ def test_who_takes_over_ends_what_stands_still_as_it_speaks(both, role):
         assert process.wait(10) == -signal.SIGKILL
         assert taker.turn(1.2)
         assert taker.teller.ended == ""
+
+
+KEEPS = """
+import socket, sys, time
+from skytether.guard.board import Place
+Place(int(sys.argv[1]), int(sys.argv[2])).keep()
+wheels = socket.create_connection(("127.0.0.1", int(sys.argv[3])))
+wheels.setblocking(False)
+try:
+    while sys.argv[4] == "more":
+        wheels.send(bytes(65536))
+except BlockingIOError:
+    pass
+wheels.send(b"velocity") if sys.argv[4] == "little" else None
+print("has told", flush=True)
+time.sleep(60)
+"""
+
+
+@contextmanager
+def who_told_by_tcp(page, role, how_much):
+    """A process that stands still behind a connection that nobody reads; of more than that holds it keeps a part."""
+    file, start = page.place(role)
+    with socket.create_server(("127.0.0.1", 0)) as wheels:
+        command = [sys.executable, "-c", KEEPS, str(file), str(start), str(wheels.getsockname()[1]), how_much]
+        process = subprocess.Popen(command, pass_fds=[file], stdout=subprocess.PIPE)
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"has told\n"
+            yield process
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def test_who_stands_still_with_a_word_that_its_kernel_sends_again_is_ended(both):
+    """The network was cut, and the first frozen: its velocities came amid the standstills of the second."""
+    first, second = both
+    with who_told_by_tcp(first.board, Role.FIRST, "more") as process:
+        first.turn(1.0, FAST)
+        second.turn(1.03)
+        assert second.turn(1.05)
+        assert second.teller.ended == "", "it may be acknowledged yet"
+        assert second.turn(1.07)
+        assert second.teller.ended.startswith(f"process {process.pid} stood still")
+        assert process.wait(10) == -signal.SIGKILL
+        assert second.turn(1.09)
+        assert second.teller.ended == ""
+
+
+def test_who_stands_still_and_was_heard_is_not_ended(both):
+    first, second = both
+    with who_told_by_tcp(first.board, Role.FIRST, "little") as process:
+        first.turn(1.0, FAST)
+        assert [second.turn(1.0 + i * PERIOD) for i in range(1, 10)][-1]
+        assert second.teller.ended == ""
+        assert process.poll() is None
 
 
 def test_who_goes_on_speaking_ends_nothing(both):

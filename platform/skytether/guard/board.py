@@ -18,6 +18,7 @@ from math import inf, isfinite, isnan, nan
 from typing import NamedTuple
 from zlib import crc32
 
+from .kernel_buffers import is_anything_unacknowledged
 from .protocol import LastCommand
 from .velocity import Velocity
 
@@ -42,6 +43,10 @@ class Role(IntEnum):
     """The guard, or on a graph the writer."""
     SECOND = 1
     """The gate, while the first says nothing."""
+
+
+_KEEPERS = len(Role) * _PROCESSES
+"""From where a role locks the one byte to where it locks the other."""
 
 
 class Entry(NamedTuple):
@@ -69,6 +74,19 @@ class Place(NamedTuple):
     """Descriptor of the board."""
     start: int
 
+    def keep(self) -> None:
+        """Say, until this process ends, that its connections keep what was not acknowledged, and send it again.
+
+        Raises:
+            OSError: The kernel does not take it.
+        """
+        fcntl.lockf(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, self.start + _KEEPERS + os.getpid())
+
+    def keeper(self) -> int:
+        """A process that said so, and has something that was not acknowledged; 0: there is none."""
+        pid = self._holder(self.start + _KEEPERS)
+        return pid if pid and is_anything_unacknowledged(pid) else 0
+
     def end_speaker(self, patience_s: float) -> int:
         """End a process that stands still as it tells the wheels something.
 
@@ -82,25 +100,30 @@ class Place(NamedTuple):
         Returns:
             Its number; 0: there is none, or it is not ours to end.
         """
-        pid = self._speaker()
+        pid = self._holder(self.start)
         for _ in range(_LOOKS):
             if not pid:
                 return 0
             time.sleep(patience_s / _LOOKS)
-            pid = pid if self._speaker() == pid else 0
-        try:
-            os.kill(pid, signal.SIGKILL)
-        except OSError:
-            return 0
-        return pid
+            pid = pid if self._holder(self.start) == pid else 0
+        return end(pid)
 
-    def _speaker(self) -> int:
-        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, self.start, _PROCESSES, 0)
+    def _holder(self, start: int) -> int:
+        asked = _LOCK.pack(fcntl.F_WRLCK, os.SEEK_SET, start, _PROCESSES, 0)
         try:
             kind, _, _, _, pid = _LOCK.unpack(fcntl.fcntl(self.file, fcntl.F_GETLK, asked))
         except OSError:
             return 0
         return 0 if kind == fcntl.F_UNLCK else max(0, int(pid))
+
+
+def end(pid: int) -> int:
+    """End a process: its number; 0: it is gone, or not ours to end."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except OSError:
+        return 0
+    return pid
 
 
 class Board:

@@ -12,6 +12,8 @@ the other one has either seen that or cannot speak any more:
 - Where another process sends what is written, and stands still or fails, the wheels were told what had left before
   that, and whoever is next goes on from there. What goes on from something leaves while the wheels turn by what is
   known to have left, or never: after that they stand.
+- Where the kernel keeps what was sent until it is acknowledged, and sends it again, who stood still with something of
+  that is ended by who has taken over (`board.Place.keep`).
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -32,7 +34,7 @@ from collections.abc import Callable
 from math import inf, isnan, nan
 from typing import NamedTuple, Protocol
 
-from .board import Board, Entry, Role
+from .board import Board, Entry, Role, end
 from .protocol import LastCommand
 from .velocity import STANDSTILL, Velocity
 from .watch import Watch
@@ -49,6 +51,9 @@ _SOON = 0.5
 """Periods. So much later than the second's claim the first may still speak without a claim of its own."""
 _UNREAD = "their driver does not read what it is sent"
 _ENDED = "process {} stood still as it told the wheels something, and was ended: it would go on with what is old by now"
+_KEPT = "process {} stood still, and was ended: what it told the wheels last was not acknowledged, and would come later"
+_KEPT_S = 0.06
+"""Later than Linux puts off an acknowledgement, and sooner than it sends anything again (0.04 and 0.2 s)."""
 _LATER = 2
 """Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
 _WRITTEN = 256
@@ -148,6 +153,8 @@ class Teller:
         """What is wrong with those who were told something last: they do not acknowledge it; empty: nothing."""
         self.ended = ""
         """Whether a process was ended at the last attempt, in words; empty: none was."""
+        self._follows = False
+        """Whether something of the other one may be on its way still."""
         self._broken_at = nan
         self._full_at = nan
         self._own, self._claim, self._left_at = board.of(role)  # of who had the role before
@@ -203,11 +210,7 @@ class Teller:
         self.unread = self._wheels.unread()
         missed = self._sent is not None and self._sent.unheard  # a standstill would be missed, and not what follows
         velocity, _ = self._watch.want(now, stopped or missed or bool(self.unread))
-        other = _OTHER[self._role]
-        spoke = self._board.of(other).told.at
-        if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
-            pid = self._board.place(other).end_speaker(SPEAKS * self._period_s)
-            self.ended = _ENDED.format(pid) if pid else ""
+        self._end_other(now)
         at, goes_on = self._clock(), self._watch.goes_on(now) and self._watch.told.velocity != STANDSTILL
         until = at + FRESH * self._period_s  # from this look on: this process may stand still at any moment
         if goes_on:
@@ -230,6 +233,19 @@ class Teller:
         self._left_at = self._heard_at if self._sent else now
         self._put(self._watch.told)
         return True
+
+    def _end_other(self, now: float) -> None:
+        """Whose place this one takes, or has taken, and who stands still with a word that would come later."""
+        other = _OTHER[self._role]
+        place, spoke = self._board.place(other), self._board.of(other).told.at
+        if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
+            pid = place.end_speaker(SPEAKS * self._period_s)
+            self.ended = _ENDED.format(pid) if pid else ""
+            self._follows = True
+        if self._follows and now - spoke > _KEPT_S:
+            self._follows = False
+            if (pid := place.keeper()) and end(pid):
+                self.ended = _KEPT.format(pid)
 
     def _waits(self, now: float) -> bool:
         """Whether the wheels may still turn by what they read late, and what is told now begins at a standstill.

@@ -38,7 +38,7 @@ class Ros1Wheels(RosWheels[Node]):
         timing: Nobody gets a velocity or a level that is older than `WheelsTiming.fresh_s`: it is the node's own thread
             that sends them, and this process may stand still meanwhile.
         enable_topic: Of the enable signal, std_msgs/Bool; empty: there is none.
-        place: Where that thread says that it is about to send one.
+        place: Where that thread says that it is about to send one, and this process that its kernel keeps some.
 
     Raises:
         OSError: The node cannot be.
@@ -51,6 +51,8 @@ class Ros1Wheels(RosWheels[Node]):
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._heard: Heard | None = None
         super().__init__(_start(way, role))
+        if place:
+            place.keep()
         topic = resolve(way.cmd_vel, way.namespace)
         speaking = Speaking(*place) if place else nullcontext
         self._nodes = [resolve(name, way.namespace) for name in way.wheels_nodes]
