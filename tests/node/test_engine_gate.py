@@ -32,7 +32,7 @@ from skytether.node.cgroups import Cgroups
 from skytether.node.engine_gate import EngineGate
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
-from skytether.node.removals import Removals
+from skytether.node.removals import BusyError, Removals
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.docker.reports import unpacked
 
@@ -1160,8 +1160,64 @@ def test_of_what_was_there_before_nobody_knows_whom_it_met(
             engine.running.add(Z)
         await site.ask(f"DELETE /v1.41/containers/{X}?v=1&force=1")
         await site.ask(f"DELETE /v1.41/containers/{Y}?v=1&force=1")
-        old = [f"volumes/{OWN}"] if state == "is idle" else []
-        assert site.removed == [f"containers/{X}?force=1", *old, f"containers/{Y}?force=1", f"volumes/{new}"]
+        assert site.removed == [f"containers/{X}?force=1", f"containers/{Y}?force=1", f"volumes/{new}"]
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("ends", ["has run", "is gone", "was started by this one"])
+def test_a_start_that_an_earlier_program_asked_for_may_wait_while_its_engine_says_that_nothing_runs(
+    engine: Engine, ends: str
+) -> None:
+    """Whoever keeps the engine busy with that container had the files of volumes removed in which it ran soon."""
+    engine.volumes = [{"Name": OWN}]
+    engine.others = {Z: in_volumes(), OWN: {}}
+    engine.idle = {Z}
+    removes = f"DELETE /v1.41/volumes/{OWN}?force=0"
+
+    async def run() -> None:
+        site = Site(engine)
+        for _ in range(2):
+            assert b"409 Conflict" in await site.ask(removes)
+        if ends == "has run":
+            engine.others[Z] = {**in_volumes(), "State": {"Running": False, "StartedAt": "2026-11-28T09:00:00Z"}}
+        elif ends == "is gone":
+            engine.unknown, engine.idle = {Z}, set()
+        else:
+            await site.start(Z)
+            engine.running = set()
+        assert b"200 OK" in await site.ask(removes)
+
+    asyncio.run(run())
+
+
+def test_into_what_was_there_before_nothing_is_put(engine: Engine) -> None:
+    """It may be about to start: an engine writes through a link that is made there meanwhile."""
+    engine.others = {Z: {"Mounts": [OWN_VOLUME]}}
+
+    async def run() -> None:
+        for there in (set(), {Z}):
+            engine.idle = there
+            removals = Removals(engine.path)
+            done = await removals.put(Z, f"/containers/{Z}/archive?path=/run", b"", "")
+            assert (done is None) == bool(there)
+
+    asyncio.run(run())
+
+
+def test_calls_by_which_one_container_may_end_are_few_at_a_time(engine: Engine) -> None:
+    """Each waits for its lock at the engine, and so does whoever asks whether it runs."""
+
+    async def run() -> None:
+        removals, goes_on = Removals(engine.path), asyncio.Event()
+        asks = [asyncio.create_task(removals.end(X, goes_on.wait)) for _ in range(16)]
+        while removals._ending[X] < 16:  # noqa: SLF001 how many there are
+            await asyncio.sleep(0.01)
+        with pytest.raises(BusyError, match="too much is asked"):
+            await removals.end(X, goes_on.wait)
+        goes_on.set()
+        assert all(await asyncio.gather(*asks))
+        assert await removals.end(X, goes_on.wait)
 
     asyncio.run(run())
 

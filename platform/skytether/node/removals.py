@@ -34,17 +34,21 @@ _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
 _SETTLED_S = 3.0
 """For an engine to say what a container is that it does not start just now."""
+_JOINED_S = 60.0
+"""For a start to begin that an earlier program may have asked for, with the one paused whose network is joined."""
 _GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused."""
 _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
-_MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN = 512, 128, 4
-"""Under way at a time, and in line for one network: an engine may take its time for each, and whoever asked may be gone
-meanwhile."""
+_MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN, _MOST_ENDING = 512, 128, 4, 16
+"""Under way at a time, in line for one network, and by which one container may end: an engine may take its time for
+each, and whoever asked may be gone meanwhile."""
 _MOST_MINE = 1 << 15
 _MOST_TOLD = 100
 _MOST_ASKED = 32
 """Containers that are asked for at a time: of one that an engine just starts it says nothing for some seconds."""
+_RUN = "StartedAt", "ExitCode", "Error"
+"""What an engine says of a container's last run, and of a start that failed."""
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
@@ -82,6 +86,12 @@ class Removals:
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
         """Containers that this program had started: whom those meet that another one started, it does not see."""
+        self._unsure: dict[str, int | None] = {}
+        """By container that was there before this program: what the engine said of its last run; None: nothing yet.
+
+        An earlier program may have asked for its start, and that wait at the engine, which says meanwhile that it does
+        not run. It has begun when the engine says something else.
+        """
         self._puts: Counter[str] = Counter()
         """How much is being put into each container."""
         self._joined: Counter[str] = Counter()
@@ -124,8 +134,13 @@ class Removals:
             if joined:
                 self._joined[joined] += 1
             task = self._starts[container] = begun(self._start(path, joined))
-            task.add_done_callback(lambda _: self._starts.pop(container))
+            task.add_done_callback(lambda _: self._has_started(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
+
+    def _has_started(self, container: str) -> None:
+        task = self._starts.pop(container)
+        if not task.cancelled() and not task.exception() and task.result().status < HTTPStatus.MULTIPLE_CHOICES:
+            self._unsure.pop(container, None)  # who asked before was before us in the line, too
 
     async def _start(self, path: str, joined: str) -> Answer:
         """With the one whose network it joins paused meanwhile; empty: it has its own.
@@ -171,6 +186,8 @@ class Removals:
         Who joins it just now is waited for; who wants to, does not any more.
         """
         await self.look_back()
+        if self._ending[container] >= _MOST_ENDING:
+            raise BusyError("too much is asked of that container just now")
         self._ending[container] += 1
         try:
             if (joining := self._pauses.get(container)) is not None:
@@ -202,7 +219,7 @@ class Removals:
         answer = await ask_soon(self._engine, f"/containers/{container}/json")
         takes = answer.status == HTTPStatus.OK and _takes_files(answer.content, own)
         del answer  # it may be large, and the engine may take any time
-        if container in self._mine or not takes:
+        if container in self._mine or container in self._unsure or not takes:
             return None
         self._puts[container] += 1
         task = begun(ask_long(self._engine, path, method="PUT", body=archive))
@@ -317,6 +334,7 @@ class Removals:
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
+            self._unsure = dict.fromkeys(there)
             old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
             for paused in old:
                 if there[paused].get("State") != "paused":
@@ -343,9 +361,10 @@ class Removals:
 
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
         """An earlier program may have ended while it had it paused, for others that joined its network."""
+        until = time.monotonic() + _JOINED_S
         try:
             for one in joining:
-                while not await self._is_settled(one):
+                while not await self._is_settled(one, until):
                     await asyncio.sleep(_SETTLED_S)
             await self._go_on(container)
         finally:
@@ -385,10 +404,18 @@ class Removals:
         try:
             answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
             if answer.status == HTTPStatus.NOT_FOUND:
+                self._unsure.pop(container, None)
                 return False
-            return picked(answer.content, "State", "Running")["State"]["Running"] is not False
+            state = picked(answer.content, "State", "Running", *_RUN)["State"]
+            running, run = state["Running"] is not False, hash(tuple(str(state.get(key)) for key in _RUN))
         except (OSError, ValueError, LookupError, TypeError):
             return True
+        if container in self._unsure:
+            if not running and self._unsure[container] in (None, run):
+                self._unsure[container] = run
+                return True
+            del self._unsure[container]
+        return running
 
     def _goes_on(self, container: str, cgroups: Cgroups) -> bool:
         """Whether processes of a container go on of which the engine says that it does not run."""
@@ -415,8 +442,13 @@ class Removals:
                     found.add(container)
         return found
 
-    async def _is_settled(self, container: str) -> bool:
-        """Whether an engine says anything of it: not while it starts it."""
+    async def _is_settled(self, container: str, until: float) -> bool:
+        """Whether a start of it that an earlier program may have asked for has ended: an engine says nothing meanwhile.
+
+        Whether one waits there nobody knows, and so none is waited for after ``until`` [s].
+        """
+        if await self._may_run(container) and container in self._unsure and time.monotonic() < until:
+            return False
         try:
             await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
         except (OSError, ValueError):

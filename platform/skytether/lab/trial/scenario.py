@@ -58,7 +58,7 @@ class TrialSettings:
     seed: int = 1
     docker: Mapping[str, Any] | None = None
     image: str = ""
-    start_limit_s: float = 120.0
+    start_limit_s: float = 300.0
     drive_limit_s: float = 400.0
 
     def document(self) -> dict[str, Any]:
