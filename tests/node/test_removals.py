@@ -41,8 +41,15 @@ class Gated:
     def labels(self) -> dict[str, str]:
         return {"skytether.io/owner": self.name}
 
-    def make(self, *shared: str, network: str = "") -> tuple[str, str]:
-        """A container that runs, and the volume that it alone has."""
+    def network(self) -> None:
+        """One of its own."""
+        options = {"com.docker.network.bridge.name": f"skt-{self.name[-8:]}"}
+        body = {"Name": self.name, "CheckDuplicate": True, "Driver": "bridge", "Options": options}
+        made = self.ask("POST /networks/create", {**body, "Labels": {"skytether.io/network": "filtered"}})
+        assert made.status == HTTPStatus.CREATED, made.content
+
+    def make(self, *shared: str, network: str = "", starts: bool = True) -> tuple[str, str]:
+        """A container that runs, or is to be started, and the volume that it alone has."""
         owned = {"Labels": self.labels}
         mounts = [{"Type": "volume", "Target": "/own", "VolumeOptions": owned}] + [
             {"Type": "volume", "Source": one, "Target": f"/{one}", "VolumeOptions": {**owned, "NoCopy": True}}
@@ -65,8 +72,9 @@ class Gated:
         made = self.ask(f"POST /containers/create?name={self.name}-{secrets.token_hex(4)}", body)
         assert made.status == HTTPStatus.CREATED, made.content
         container = str(json.loads(made.content)["Id"])
-        started = self.ask(f"POST /containers/{container}/start")
-        assert (started.status, started.content) == (HTTPStatus.NO_CONTENT, b"")
+        if starts:
+            started = self.ask(f"POST /containers/{container}/start")
+            assert (started.status, started.content) == (HTTPStatus.NO_CONTENT, b"")
         found = json.loads(self.ask(f"GET /containers/{container}/json").content)
         (own,) = (str(one["Name"]) for one in found["Mounts"] if one["Destination"] == "/own")
         return container, own
@@ -131,12 +139,9 @@ def gated(docker_engine: str) -> Iterator[Gated]:
 
 
 def test_files_are_removed_when_nobody_runs_who_may_have_a_folder_of_them(gated: Gated) -> None:
-    options = {"com.docker.network.bridge.name": f"skt-{gated.name[-8:]}"}
-    network = {"Name": gated.name, "CheckDuplicate": True, "Driver": "bridge", "Options": options}
     # It looks back first: what others run at this engine meets nothing that is made here.
     assert gated.ask(f"DELETE /volumes/{secrets.token_hex(32)}").status == HTTPStatus.NOT_FOUND
-    made = gated.ask("POST /networks/create", {**network, "Labels": {"skytether.io/network": "filtered"}})
-    assert made.status == HTTPStatus.CREATED, made.content
+    gated.network()
     shared = f"{gated.name}-shared"
     assert gated.ask("POST /volumes/create", {"Name": shared, "Labels": gated.labels}).status == HTTPStatus.CREATED
     one, own = gated.make(shared)
@@ -160,13 +165,26 @@ def test_files_are_removed_when_nobody_runs_who_may_have_a_folder_of_them(gated:
 
 def test_whose_network_another_one_joins_goes_on_after_that(gated: Gated) -> None:
     """It is paused meanwhile."""
-    options = {"com.docker.network.bridge.name": f"skt-{gated.name[-8:]}"}
-    network = {"Name": gated.name, "CheckDuplicate": True, "Driver": "bridge", "Options": options}
-    network["Labels"] = {"skytether.io/network": "filtered"}
-    assert gated.ask("POST /networks/create", network).status == HTTPStatus.CREATED
+    gated.network()
     holds, _ = gated.make()
     joins, _ = gated.make(network=f"container:{holds}")
     states = [json.loads(gated.ask(f"GET /containers/{one}/json").content)["State"] for one in (holds, joins)]
     assert [state["Status"] for state in states] == ["running", "running"]
     assert gated.ask(f"POST /containers/{holds}/kill?signal=KILL").status == HTTPStatus.NO_CONTENT
     assert gated.ask(f"DELETE /containers/{joins}?force=1").status == HTTPStatus.NO_CONTENT
+
+
+def test_who_starts_after_a_restart_of_the_node_by_what_was_asked_before_it_has_kin(gated: Gated) -> None:
+    """That start waited at the engine, which said meanwhile that nothing runs; files of the machine were removed."""
+    gated.network()
+    late, own = gated.make(starts=False)
+    with tempfile.TemporaryDirectory(prefix="sky-") as folder, gate_at(str(Path(folder) / "gate.sock")):
+        again = Gated(str(Path(folder) / "gate.sock"), gated.name)
+        assert again.ask(f"DELETE /volumes/{secrets.token_hex(32)}").status == HTTPStatus.NOT_FOUND  # it looks back
+        assert ask(ENGINE, f"/v1.41/containers/{late}/start", method="POST").status == HTTPStatus.NO_CONTENT
+        holds, _ = again.make(network=f"container:{late}")
+        assert again.ask(f"DELETE /containers/{late}?v=1&force=1").status == HTTPStatus.NO_CONTENT
+        assert again.ask(f"DELETE /volumes/{own}").status == HTTPStatus.CONFLICT
+        assert again.has(own)
+        assert again.ask(f"DELETE /containers/{holds}?force=1").status == HTTPStatus.NO_CONTENT
+        assert again.ask(f"DELETE /volumes/{own}").status == HTTPStatus.NO_CONTENT
