@@ -43,6 +43,14 @@ def test_an_old_one_is_named(python):
         find_python(python("python3", "", 1))
 
 
+def test_one_that_a_signal_ends_is_named(python, tmp_path):
+    """With a /dev/shm of 4 KiB it was called too old."""
+    dies = python("dies")
+    (tmp_path / "dies").write_text("#!/bin/sh\nkill -BUS $$\n")
+    with pytest.raises(Ros2Error, match="ends by SIGBUS"):
+        find_python(dies)
+
+
 @pytest.mark.slow
 @pytest.mark.ros2
 def test_real_ones(ros2):

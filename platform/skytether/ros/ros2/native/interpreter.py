@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -60,6 +61,8 @@ def _trouble(python: str, environment: Mapping[str, str]) -> str:
         return str(error)
     if done.returncode == 0:
         return ""
+    if done.returncode < 0:  # of a small /dev/shm, say, it is SIGBUS
+        return f"ends by {signal.Signals(-done.returncode).name} as it imports rclpy"
     lines = done.stderr.strip().splitlines()
     return lines[-1] if lines else f"older than Python {OLDEST[0]}.{OLDEST[1]}"
 
