@@ -32,7 +32,6 @@ from skytether.lab.trail import Trail
 from skytether.lab.walker import Arms, Walker, WalkerParams
 
 STEP, MOST = 0.01, 20  # seconds; steps at once after a time without a core: more would be a jump
-EACH = 2  # steps for one that is felt: two such robots and their services at 100 Hz want more than two slow cores
 of_walker, of_person = np.random.default_rng(1).spawn(2)
 walker, person = Walker(WalkerParams(), of_walker), Person(PersonParams(), Trail(TRAIL), of_person)
 arms, command = Arms(0.0, 0.0), Twist()
@@ -57,7 +56,8 @@ def turn():
         distance = walker.params.sensor_distance
         arms = person.step(walker.pose, walker.velocity, distance, STEP, walking=walking)
         if steps % EACH == 0:
-            now = [*walker.measure(arms), *walker.wheels, *walker.odometry, *walker.velocity, float(steps % 10 == 0)]
+            fifth = float(steps % (5 * EACH) == 0)
+            now = [*walker.measure(arms), *walker.wheels, *walker.odometry, *walker.velocity, fifth]
             felt.publish(Float64MultiArray(data=now))
         if walking and steps % 4 == 0:
             say(["at", steps * STEP, walker.pose.x, walker.pose.y])
@@ -88,14 +88,14 @@ def tell(name, message, frame):
     note(name, message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
     topics[name].publish(message)
 def both(felt):
-    left, right, *wheels, x, y, heading, linear, angular, tenth = felt.data
+    left, right, *wheels, x, y, heading, linear, angular, fifth = felt.data
     force = WrenchStamped()
     force.wrench.force.x, force.wrench.torque.z = left + right, (right - left) * DISTANCE / 2
     tell("force", force, "base_link")
     state = JointState(name=["left_wheel", "right_wheel"])
     state.position, state.velocity = wheels[:2], wheels[2:]
     tell("wheels", state, "")
-    if tenth:
+    if fifth:
         odom = Odometry(child_frame_id="base_link")
         odom.pose.pose.position.x, odom.pose.pose.position.y = x, y
         odom.pose.pose.orientation.z, odom.pose.pose.orientation.w = math.sin(heading / 2), math.cos(heading / 2)
@@ -138,18 +138,21 @@ class Ros2Walker:
         where: The robot's network.
         trail: What the person sees.
         folder: For the diary.
+        each: Steps of 10 ms for one message of force and wheels.
 
     Attributes:
         diary: Sensor messages that were published (``force``, ``wheels``, ``odom``: the stamp), and velocities that the
             wheels were ``told``: time [ns], linear, angular.
     """
 
-    def __init__(self, nodes: Ros2Nodes, name: str, where: Namespace | None, trail: Segments, folder: Path) -> None:
+    def __init__(
+        self, nodes: Ros2Nodes, name: str, where: Namespace | None, trail: Segments, folder: Path, each: int
+    ) -> None:
         self._nodes, self._namespace, self._where = nodes, f"/{name}", where
         self.judge = Judge(Trail(trail))
         self.diary = Diary(folder / f"{name}.diary")
         self._before = f"PLATFORM, TRAIL = {str(Path(__file__).parents[2] / 'platform')!r}, {list(trail)!r}\n"
-        self._before += f"DIARY, DISTANCE = {str(self.diary.path)!r}, 0.5\n{_DIARY}"
+        self._before += f"DIARY, DISTANCE, EACH = {str(self.diary.path)!r}, 0.5, {each}\n{_DIARY}"
         self._base = nodes.start(self._before + _BASE, "base", self._namespace, where)
         self._sensors = self._start("sensors", _SENSORS)
 

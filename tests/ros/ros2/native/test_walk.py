@@ -62,11 +62,11 @@ def scene(ros2_nodes, tmp_path):
 class Walk:
     """A walker, its agent, and the diary of the service's nodes."""
 
-    def __init__(self, scene, nodes, name, trail):
+    def __init__(self, scene, nodes, name, trail, each=2):
         self.service = Diary(scene.diaries / f"{name}-trail")
         params = {**pieces(trail), "diary": str(self.service.path)}
         self.agent = scene.robot(name, "trail", params=params)
-        self.walker = Ros2Walker(nodes, name, scene.link.robot, trail, scene.diaries)
+        self.walker = Ros2Walker(nodes, name, scene.link.robot, trail, scene.diaries, each)
         self.agent.start()
 
     def begin(self):
@@ -172,7 +172,8 @@ def test_each_part_of_one_robot_is_killed_beside_another_and_both_walks_are_fini
 
     The other robot of the domain, with a service of its own, does not notice.
     """
-    walk, other = (Walk(scene, ros2_nodes, name, [{"length": 3.5}]) for name in ("anna", "ben"))
+    # At the rate of one robot two of them, with their services, want all that two slow cores have.
+    walk, other = (Walk(scene, ros2_nodes, name, [{"length": 3.5}], each=4) for name in ("anna", "ben"))
     agent, walker = walk.agent, walk.walker
     for each in (walk, other):
         each.begin()
