@@ -27,7 +27,7 @@ def an_image(docker_engine: str, tmp_path: Path) -> Iterator[Import]:
     def make(links: dict[str, str]) -> str:
         path = tmp_path / f"{len(names)}.tar"
         with tarfile.open(path, "w") as archive:
-            for folder in ("own", "usr", "usr/sbin"):
+            for folder in ("own", "usr", "usr/sbin", "proc", "proc/self"):
                 row = tarfile.TarInfo(folder)
                 row.type, row.mode = tarfile.DIRTYPE, 0o755
                 archive.addfile(row)
@@ -58,6 +58,9 @@ def an_image(docker_engine: str, tmp_path: Path) -> Iterator[Import]:
         ({"sbin": "own/sbin"}, True),
         ({"sbin": "/proc/self/cwd/usr/sbin"}, True),
         ({"sbin": "again", "again": "own/sbin"}, True),
+        # In the image these end at /usr/sbin, and in the container they do not.
+        ({"sbin": "own/link", "own/link": "/usr/sbin"}, True),
+        ({"sbin": "/proc/self/cwd", "proc/self/cwd": "/usr/sbin"}, True),
         ({"usr/sbin/docker-init": "/own/init", "sbin": "usr/sbin"}, True),
     ],
 )
