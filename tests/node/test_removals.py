@@ -56,12 +56,14 @@ def test_whose_network_another_one_joins_goes_on_after_that(gated: Gated) -> Non
 def test_who_starts_after_a_restart_of_the_node_by_what_was_asked_before_it_has_kin(gated: Gated) -> None:
     """That start waited at the engine, which said meanwhile that nothing runs; files of the machine were removed."""
     gated.network()
-    late, own = gated.make(starts=False)
+    shared = f"{gated.name}-shared"
+    assert gated.ask("POST /volumes/create", {"Name": shared, "Labels": gated.labels}).status == HTTPStatus.CREATED
+    late, own = gated.make(shared, starts=False)
     with tempfile.TemporaryDirectory(prefix="sky-") as folder, gate_at(str(Path(folder) / "gate.sock")):
         again = Gated(str(Path(folder) / "gate.sock"), gated.name)
         assert again.ask(f"DELETE /volumes/{secrets.token_hex(32)}").status == HTTPStatus.NOT_FOUND  # it looks back
         assert ask(ENGINE, f"/v1.41/containers/{late}/start", method="POST").status == HTTPStatus.NO_CONTENT
-        holds, _ = again.make(network=f"container:{late}")
+        holds, _ = again.make(shared)
         assert again.ask(f"DELETE /containers/{late}?v=1&force=1").status == HTTPStatus.NO_CONTENT
         assert again.ask(f"DELETE /volumes/{own}").status == HTTPStatus.CONFLICT
         assert again.has(own)

@@ -34,8 +34,8 @@ _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
 _SETTLED_S = 3.0
 """For an engine to say what a container is that it does not start just now."""
-_JOINED_S = 60.0
-"""For a start to begin that an earlier program may have asked for, with the one paused whose network is joined."""
+_QUIET_S = 60.0
+"""For what an earlier program asked for to begin at the engine: starts, and what ends a container."""
 _GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused."""
 _OWN = re.compile("[0-9a-f]{64}")
@@ -47,8 +47,6 @@ _MOST_MINE = 1 << 15
 _MOST_TOLD = 100
 _MOST_ASKED = 32
 """Containers that are asked for at a time: of one that an engine just starts it says nothing for some seconds."""
-_RUN = "StartedAt", "ExitCode", "Error"
-"""What an engine says of a container's last run, and of a start that failed."""
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
@@ -81,16 +79,17 @@ class Removals:
         self._kin = Kin()
         self._looking = asyncio.Lock()
         self._looked_back, self._began = False, time.time()
+        self._quiet_from = time.monotonic() + _QUIET_S
         self._learning: asyncio.Task[None] | None = None
         self._starts: dict[str, asyncio.Task[Answer]] = {}
         """By container: before a start has ended, an engine may not yet list it as running."""
         self._mine: set[str] = set()
         """Containers that this program had started: whom those meet that another one started, it does not see."""
-        self._unsure: dict[str, int | None] = {}
-        """By container that was there before this program: what the engine said of its last run; None: nothing yet.
+        self._old: set[str] | None = None
+        """Containers that were there before this program, so long as they are; None: the engine has not listed any yet.
 
-        An earlier program may have asked for its start, and that wait at the engine, which says meanwhile that it does
-        not run. It has begun when the engine says something else.
+        What an earlier program asked for of one may wait at the engine, a start too, and the engine says meanwhile that
+        it does not run.
         """
         self._puts: Counter[str] = Counter()
         """How much is being put into each container."""
@@ -123,6 +122,8 @@ class Removals:
         (joined,) = joins or ("",)
         if joined in self._ending:
             raise BusyError(_ENDS)
+        if joined and self._is_old(joined) and time.monotonic() < self._quiet_from:
+            raise BusyError("this node has just begun, and what it was asked for before may end what it joins")
         if joined and container not in self._starts and self._joined[joined] >= _MOST_JOIN:
             raise BusyError("too many containers join that network just now")
         self._kin.meet(things)
@@ -134,13 +135,8 @@ class Removals:
             if joined:
                 self._joined[joined] += 1
             task = self._starts[container] = begun(self._start(path, joined))
-            task.add_done_callback(lambda _: self._has_started(container))
+            task.add_done_callback(lambda _: self._starts.pop(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
-
-    def _has_started(self, container: str) -> None:
-        task = self._starts.pop(container)
-        if not task.cancelled() and not task.exception() and task.result().status < HTTPStatus.MULTIPLE_CHOICES:
-            self._unsure.pop(container, None)  # who asked before was before us in the line, too
 
     async def _start(self, path: str, joined: str) -> Answer:
         """With the one whose network it joins paused meanwhile; empty: it has its own.
@@ -216,10 +212,12 @@ class Removals:
             own: Where a volume must be that it alone has, for files are written there; empty: there is no file.
         """
         await self.look_back()
+        if self._old is None:
+            await self._containers()
         answer = await ask_soon(self._engine, f"/containers/{container}/json")
         takes = answer.status == HTTPStatus.OK and _takes_files(answer.content, own)
         del answer  # it may be large, and the engine may take any time
-        if container in self._mine or container in self._unsure or not takes:
+        if container in self._mine or self._is_old(container) or not takes:
             return None
         self._puts[container] += 1
         task = begun(ask_long(self._engine, path, method="PUT", body=archive))
@@ -334,7 +332,6 @@ class Removals:
         asked_until = time.monotonic() + _LOOK_BACK_S
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
-            self._unsure = dict.fromkeys(there)
             old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
             for paused in old:
                 if there[paused].get("State") != "paused":
@@ -361,10 +358,11 @@ class Removals:
 
     async def _unpause(self, container: str, joining: Iterable[str]) -> None:
         """An earlier program may have ended while it had it paused, for others that joined its network."""
-        until = time.monotonic() + _JOINED_S
         try:
             for one in joining:
-                while not await self._is_settled(one, until):
+                while await self._runs(one) is False and time.monotonic() < self._quiet_from:
+                    await asyncio.sleep(_SETTLED_S)
+                while not await self._is_told_of(one):
                     await asyncio.sleep(_SETTLED_S)
             await self._go_on(container)
         finally:
@@ -397,25 +395,28 @@ class Removals:
         return found
 
     async def _may_run(self, container: str) -> bool:
-        """Each is asked for: with a full disk, an engine (20.10) may start one that its list never says to run.
+        """Whether it runs, or may."""
+        runs = await self._runs(container)
+        if runs is None and self._old is not None:
+            self._old.discard(container)
+        return runs is not None and (runs or self._is_old(container))
 
-        It says nothing of one that it starts just now, as an earlier program may have asked it to.
+    async def _runs(self, container: str) -> bool | None:
+        """Whether the engine says that it runs, or nothing; None: that there is no such container.
+
+        Each is asked for: with a full disk, an engine (20.10) may start one that its list never says to run. It says
+        nothing of one that it starts just now, as an earlier program may have asked it to.
         """
         try:
             answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
             if answer.status == HTTPStatus.NOT_FOUND:
-                self._unsure.pop(container, None)
-                return False
-            state = picked(answer.content, "State", "Running", *_RUN)["State"]
-            running, run = state["Running"] is not False, hash(tuple(str(state.get(key)) for key in _RUN))
+                return None
+            return picked(answer.content, "State", "Running")["State"]["Running"] is not False
         except (OSError, ValueError, LookupError, TypeError):
             return True
-        if container in self._unsure:
-            if not running and self._unsure[container] in (None, run):
-                self._unsure[container] = run
-                return True
-            del self._unsure[container]
-        return running
+
+    def _is_old(self, container: str) -> bool:
+        return self._old is None or container in self._old
 
     def _goes_on(self, container: str, cgroups: Cgroups) -> bool:
         """Whether processes of a container go on of which the engine says that it does not run."""
@@ -442,13 +443,8 @@ class Removals:
                     found.add(container)
         return found
 
-    async def _is_settled(self, container: str, until: float) -> bool:
-        """Whether a start of it that an earlier program may have asked for has ended: an engine says nothing meanwhile.
-
-        Whether one waits there nobody knows, and so none is waited for after ``until`` [s].
-        """
-        if await self._may_run(container) and container in self._unsure and time.monotonic() < until:
-            return False
+    async def _is_told_of(self, container: str) -> bool:
+        """Whether an engine says anything of it: not while it starts it."""
         try:
             await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
         except (OSError, ValueError):
@@ -470,7 +466,10 @@ class Removals:
     async def _containers(self) -> list[dict[str, Any]]:
         """All of orchestrators."""
         keys = ("Id", "State", _MODE, "Names.item", f"Labels.{OWNER}", "Created")
-        return await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
+        there = await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
+        if self._old is None:  # the first that is told: at the look back it may have been too much
+            self._old = {one["Id"] for one in there}
+        return there
 
 
 def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
