@@ -34,8 +34,9 @@ _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
 _SETTLED_S = 3.0
 """For an engine to say what a container is that it does not start just now."""
-_QUIET_S = 60.0
-"""For what an earlier program asked for to begin at the engine: starts, and what ends a container."""
+_QUIET_S = 15.0
+"""For what an earlier program asked for to begin at the engine: starts, and what ends a container. Of what ends one
+there are few, and an engine is at these in turn."""
 _GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused."""
 _OWN = re.compile("[0-9a-f]{64}")
@@ -111,6 +112,8 @@ class Removals:
         things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
         del inspected  # it may be large, and from here on much is waited for
         await self.look_back()
+        if any(map(self._is_old, joins)):  # an earlier program may have been asked to end it
+            await asyncio.sleep(self._quiet_from - time.monotonic())
         if not self._kin.lost and not self._kin.has_room(things):
             await self._forget_ended()
         await self._until_removed(things)
@@ -122,8 +125,6 @@ class Removals:
         (joined,) = joins or ("",)
         if joined in self._ending:
             raise BusyError(_ENDS)
-        if joined and self._is_old(joined) and time.monotonic() < self._quiet_from:
-            raise BusyError("this node has just begun, and what it was asked for before may end what it joins")
         if joined and container not in self._starts and self._joined[joined] >= _MOST_JOIN:
             raise BusyError("too many containers join that network just now")
         self._kin.meet(things)
@@ -334,7 +335,7 @@ class Removals:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
             old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
             for paused in old:
-                if there[paused].get("State") != "paused":
+                if there[paused].get("State") != "paused" or paused in self._pauses:  # by a look that failed later
                     continue
                 joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
                 self._joined[paused] += 1
