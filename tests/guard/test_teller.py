@@ -186,6 +186,35 @@ def test_what_is_acknowledged_too_late_to_go_on_is_followed_by_a_standstill(both
     assert first.wheels.told[-1].linear == pytest.approx(1.0 * 5 * PERIOD), "what began at a standstill counts"
 
 
+def test_an_acknowledgement_that_came_while_the_process_stood_still_is_late(both):
+    """It was asked for after that, by a look at the clock from before."""
+    first, _ = both
+    for i in range(20):
+        first.wheels.held = Sent(0.8 + i * PERIOD, 0.8 + i * PERIOD)
+        first.turn(0.8 + i * PERIOD, FAST)
+    first.wheels.held = Sent(1.16, 1.16)
+    first.turn(1.2, FAST)
+    first.wheels.held, first.late = Sent(1.2, 1.2), 0.1
+    assert not first.turn(1.22, FAST)
+    first.late = 0.0
+    assert not first.turn(1.29, FAST)
+    assert first.turn(1.31, FAST)
+    assert first.wheels.told[-1] == STANDSTILL
+
+
+@pytest.mark.parametrize(("late_s", "drives"), [(0.0, True), (0.055, True), (0.1, False)])
+def test_acknowledgements_may_take_the_patience_less_two_periods(both, late_s, drives):
+    first, _ = both
+    told = [0.98]
+    for i in range(100):
+        now = 1.0 + i * PERIOD
+        heard_at = max((at for at in told if at <= now - late_s), default=-inf)
+        first.wheels.held = Sent(heard_at, heard_at)
+        if first.turn(now, FAST):
+            told.append(now)
+    assert (first.wheels.told[-1] == FAST) == drives
+
+
 def test_of_a_first_step_that_nobody_heard_nothing_more_is_told(both):
     first, _ = both
     first.wheels.held = Sent(-inf, -inf)

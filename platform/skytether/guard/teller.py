@@ -168,7 +168,7 @@ class Teller:
             now: [s]
         """
         before, self._sent = self._sent, self._wheels.sent()
-        self._see_left(now)
+        self._see_left(self._clock())  # it may have come while this process stood still
         newest = self._board.newest()
         if (self._sent and self._sent.lost) or (before and before.lost):
             self._watch.told = newest.told  # what was learned may have been taken back
