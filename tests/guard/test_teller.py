@@ -545,30 +545,35 @@ KEEPS = """
 import socket, sys, time
 from skytether.guard.board import Place
 Place(int(sys.argv[1]), int(sys.argv[2])).keep()
-wheels = socket.create_connection(("127.0.0.1", int(sys.argv[3])))
-wheels.setblocking(False)
-try:
-    while sys.argv[4] == "more":
-        wheels.send(bytes(65536))
-except BlockingIOError:
-    pass
-wheels.send(b"velocity") if sys.argv[4] == "little" else None
-print("has told", flush=True)
-time.sleep(60)
+with socket.create_server(("127.0.0.1", 0)) as server:
+    print(server.getsockname()[1], flush=True)
+    wheels, _ = server.accept()
+    master = socket.create_connection(("127.0.0.1", int(sys.argv[3])))
+    for told, more in ((wheels, sys.argv[4] == "wheels"), (master, sys.argv[4] == "master")):
+        told.setblocking(False)
+        try:
+            told.send(b"velocity")
+            while more:
+                told.send(bytes(65536))
+        except BlockingIOError:
+            pass
+    print("has told", flush=True)
+    time.sleep(60)
 """
 
 
 @contextmanager
-def who_told_by_tcp(page, role, how_much):
-    """A process that stands still behind a connection that nobody reads; of more than that holds it keeps a part."""
+def who_told_by_tcp(page, role, hangs):
+    """A process that stands still, and keeps a part of what it sent the wheels or a master, which does not read it."""
     file, start = page.place(role)
-    with socket.create_server(("127.0.0.1", 0)) as wheels:
-        command = [sys.executable, "-c", KEEPS, str(file), str(start), str(wheels.getsockname()[1]), how_much]
+    with socket.create_server(("127.0.0.1", 0)) as master:
+        command = [sys.executable, "-c", KEEPS, str(file), str(start), str(master.getsockname()[1]), hangs]
         process = subprocess.Popen(command, pass_fds=[file], stdout=subprocess.PIPE)
         try:
             assert process.stdout is not None
-            assert process.stdout.readline() == b"has told\n"
-            yield process
+            with socket.create_connection(("127.0.0.1", int(process.stdout.readline()))):
+                assert process.stdout.readline() == b"has told\n"
+                yield process
         finally:
             process.kill()
             process.communicate()
@@ -577,7 +582,7 @@ def who_told_by_tcp(page, role, how_much):
 def test_who_stands_still_with_a_word_that_its_kernel_sends_again_is_ended(both):
     """The network was cut, and the first frozen: its velocities came amid the standstills of the second."""
     first, second = both
-    with who_told_by_tcp(first.board, Role.FIRST, "more") as process:
+    with who_told_by_tcp(first.board, Role.FIRST, "wheels") as process:
         first.turn(1.0, FAST)
         second.turn(1.03)
         assert second.turn(1.05)
@@ -589,9 +594,10 @@ def test_who_stands_still_with_a_word_that_its_kernel_sends_again_is_ended(both)
         assert second.teller.ended == ""
 
 
-def test_who_stands_still_and_was_heard_is_not_ended(both):
+@pytest.mark.parametrize("hangs", ["master", "nobody"])
+def test_who_stands_still_and_was_heard_by_the_wheels_is_not_ended(both, hangs):
     first, second = both
-    with who_told_by_tcp(first.board, Role.FIRST, "little") as process:
+    with who_told_by_tcp(first.board, Role.FIRST, hangs) as process:
         first.turn(1.0, FAST)
         assert [second.turn(1.0 + i * PERIOD) for i in range(1, 10)][-1]
         assert second.teller.ended == ""

@@ -6,27 +6,34 @@ import os
 from contextlib import suppress
 
 _TABLES = "tcp", "tcp6"
-_QUEUES, _INODE = 4, 9
+_LOCAL, _STATE, _QUEUES, _INODE = 1, 3, 4, 9
 """Columns of /proc/PID/net/tcp."""
+_LISTENS = "0A"
 
 
 def is_anything_unacknowledged(pid: int) -> bool:
-    """Whether a connection of a process holds bytes that the other end's kernel has not acknowledged, of Linux.
+    """Whether somebody who connected to a process has not acknowledged all that it sent him, of Linux.
 
     False also where nobody can know it: the process is gone, or is not ours to look at.
     """
     folder = f"/proc/{pid}"
     with suppress(OSError, ValueError, IndexError):
-        waiting = {inode for table in _TABLES for inode in _waiting(f"{folder}/net/{table}")}
-        return bool(waiting) and not waiting.isdisjoint(_files(folder))
+        ours = _files(folder)
+        rows = [row for table in _TABLES for row in _rows(f"{folder}/net/{table}") if f"socket:[{row[_INODE]}]" in ours]
+        ports = {_port(row) for row in rows if row[_STATE] == _LISTENS}
+        return any(
+            int(row[_QUEUES].split(":")[0], 16) for row in rows if row[_STATE] != _LISTENS and _port(row) in ports
+        )
     return False
 
 
-def _waiting(table: str) -> list[str]:
-    """Sockets of that network that have something to be acknowledged, as `_files` names them."""
+def _rows(table: str) -> list[list[str]]:
     with open(table, encoding="ascii") as file:
-        rows = [line.split() for line in file.readlines()[1:]]
-    return [f"socket:[{row[_INODE]}]" for row in rows if int(row[_QUEUES].split(":")[0], 16)]
+        return [line.split() for line in file.readlines()[1:]]
+
+
+def _port(row: list[str]) -> str:
+    return row[_LOCAL].rpartition(":")[2]
 
 
 def _files(folder: str) -> set[str]:
