@@ -594,6 +594,17 @@ def test_who_stands_still_with_a_word_that_its_kernel_sends_again_is_ended(both)
         assert second.teller.ended == ""
 
 
+def test_the_second_is_not_ended_for_what_its_kernel_keeps(both):
+    """It would know nothing of who drives, and a person would have to let the robot go on."""
+    first, second = both
+    with who_told_by_tcp(first.board, Role.SECOND, "wheels") as process:
+        first.turn(1.0, FAST)
+        assert any(second.turn(1.0 + i * PERIOD) for i in range(1, 6))
+        assert any(first.turn(1.1 + i * PERIOD, FAST) for i in range(10))
+        assert first.teller.ended == ""
+        assert process.poll() is None
+
+
 @pytest.mark.parametrize("hangs", ["master", "nobody"])
 def test_who_stands_still_and_was_heard_by_the_wheels_is_not_ended(both, hangs):
     first, second = both

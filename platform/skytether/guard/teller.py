@@ -12,8 +12,8 @@ the other one has either seen that or cannot speak any more:
 - Where another process sends what is written, and stands still or fails, the wheels were told what had left before
   that, and whoever is next goes on from there. What goes on from something leaves while the wheels turn by what is
   known to have left, or never: after that they stand.
-- Where the kernel keeps what was sent until it is acknowledged, and sends it again, who stood still with something of
-  that is ended by who has taken over (`board.Place.keep`).
+- Where the kernel keeps what was sent until it is acknowledged, and sends it again, a first that stood still with
+  something of that is ended by the second that has taken over (`board.Place.keep`).
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -241,7 +241,7 @@ class Teller:
         if not (isnan(spoke) or spoke < self._own.at):  # this one takes over
             pid = place.end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
-            self._follows = True
+            self._follows = self._role is Role.SECOND  # its own last words are few, and brake
         if self._follows and now - spoke > _KEPT_S:
             self._follows = False
             if (pid := place.keeper()) and end(pid):
