@@ -112,6 +112,11 @@ class Removals:
         things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
         del inspected  # it may be large, and from here on much is waited for
         await self.look_back()
+        if self._old is None:
+            await self._containers()
+        if self._is_old(container):  # what an earlier program was asked for may meet it as it runs
+            text = f"container {container} was there before this node's program began: remove it, and make another"
+            return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
         if any(map(self._is_old, joins)):  # an earlier program may have been asked to end it
             await asyncio.sleep(self._quiet_from - time.monotonic())
         if not self._kin.lost and not self._kin.has_room(things):
