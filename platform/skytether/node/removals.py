@@ -80,7 +80,8 @@ class Removals:
         self._kin = Kin()
         self._looking = asyncio.Lock()
         self._looked_back, self._began = False, time.time()
-        self._quiet_from = time.monotonic() + _QUIET_S
+        self._quiet_from = inf
+        """When that has begun; counted from the engine's first answer, for before that it may have been held up."""
         self._learning: asyncio.Task[None] | None = None
         self._starts: dict[str, asyncio.Task[Answer]] = {}
         """By container: before a start has ended, an engine may not yet list it as running."""
@@ -475,6 +476,7 @@ class Removals:
         there = await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
         if self._old is None:  # the first that is told: at the look back it may have been too much
             self._old = {one["Id"] for one in there}
+            self._quiet_from = time.monotonic() + _QUIET_S
         return there
 
 
