@@ -52,7 +52,7 @@ _SOON = 0.5
 _UNREAD = "their driver does not read what it is sent"
 _ENDED = "process {} stood still as it told the wheels something, and was ended: it would go on with what is old by now"
 _KEPT = "process {} stood still, and was ended: what it told the wheels last was not acknowledged, and would come later"
-_KEPT_S = 0.06
+_KEPT_S, _MOST_KEPT_S = 0.06, 0.15
 """Later than Linux puts off an acknowledgement, and sooner than it sends anything again (0.04 and 0.2 s)."""
 _LATER = 2
 """Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
@@ -242,7 +242,8 @@ class Teller:
             pid = place.end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
             self._follows = self._role is Role.SECOND  # its own last words are few, and brake
-        if self._follows and now - spoke > _KEPT_S:
+        usual_s = self._watch.patience_s - 2 * self._period_s  # what an acknowledgement may take
+        if self._follows and now - spoke > min(max(_KEPT_S, usual_s), _MOST_KEPT_S):
             self._follows = False
             if (pid := place.keeper()) and end(pid):
                 self.ended = _KEPT.format(pid)
