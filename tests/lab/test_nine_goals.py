@@ -168,7 +168,7 @@ def test_a_robot_is_driven_to_the_first_goal_by_a_service_of_its_own() -> None:
 @pytest.mark.slow
 def test_on_the_robots_own_computer_the_service_gets_no_more_than_that_has() -> None:
     scarce = replace(SCENARIOS["embedded"], cpu=0.03)  # far less than it needs
-    with NineGoalsTrial(NineGoalsSettings(scarce, goals=1, drive_limit_s=6.0)) as trial:
+    with NineGoalsTrial(NineGoalsSettings(scarce, goals=1, drive_limit_s=12.0)) as trial:
         result = trial.drive()
-    assert result.service_cpu < 0.1
+    assert result.service_cpu < 0.06
     assert not result.completed
