@@ -155,6 +155,8 @@ class Teller:
         """Whether a process was ended at the last attempt, in words; empty: none was."""
         self._follows = False
         """Whether something of the other one may be on its way still."""
+        usual_s = watch.patience_s - 2 * period_s  # what an acknowledgement may take
+        self._kept_s = min(max(_KEPT_S, usual_s), _MOST_KEPT_S)
         self._broken_at = nan
         self._full_at = nan
         self._own, self._claim, self._left_at = board.of(role)  # of who had the role before
@@ -242,8 +244,7 @@ class Teller:
             pid = place.end_speaker(SPEAKS * self._period_s)
             self.ended = _ENDED.format(pid) if pid else ""
             self._follows = self._role is Role.SECOND  # its own last words are few, and brake
-        usual_s = self._watch.patience_s - 2 * self._period_s  # what an acknowledgement may take
-        if self._follows and now - spoke > min(max(_KEPT_S, usual_s), _MOST_KEPT_S):
+        if self._follows and now - spoke > self._kept_s:
             self._follows = False
             if (pid := place.keeper()) and end(pid):
                 self.ended = _KEPT.format(pid)

@@ -112,9 +112,7 @@ class Removals:
         """Have the engine start one, which is kin of what it shares something with from now on."""
         things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
         del inspected  # it may be large, and from here on much is waited for
-        await self.look_back()
-        if self._old is None:
-            await self._containers()
+        await self._know_old()
         if self._is_old(container):  # what an earlier program was asked for may meet it as it runs
             text = f"container {container} was there before this node's program began: remove it, and make another"
             return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
@@ -218,9 +216,7 @@ class Removals:
             archive: What is unpacked.
             own: Where a volume must be that it alone has, for files are written there; empty: there is no file.
         """
-        await self.look_back()
-        if self._old is None:
-            await self._containers()
+        await self._know_old()
         answer = await ask_soon(self._engine, f"/containers/{container}/json")
         takes = answer.status == HTTPStatus.OK and _takes_files(answer.content, own)
         del answer  # it may be large, and the engine may take any time
@@ -421,6 +417,12 @@ class Removals:
             return picked(answer.content, "State", "Running")["State"]["Running"] is not False
         except (OSError, ValueError, LookupError, TypeError):
             return True
+
+    async def _know_old(self) -> None:
+        """Look back, and have the engine list what was there, where it could not do that at the look back."""
+        await self.look_back()
+        if self._old is None:
+            await self._containers()
 
     def _is_old(self, container: str) -> bool:
         return self._old is None or container in self._old
