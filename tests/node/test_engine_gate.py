@@ -32,9 +32,10 @@ from skytether.node import machine
 from skytether.node.archives import leads_straight, misleads
 from skytether.node.cgroups import Cgroups
 from skytether.node.engine_gate import EngineGate
+from skytether.node.joins import BusyError, Joins
 from skytether.node.kin import Kin
 from skytether.node.machine import is_taken, picked
-from skytether.node.removals import BusyError, Removals
+from skytether.node.removals import Removals
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 from skytether.orchestrator.runtimes.docker.reports import unpacked
 
@@ -184,6 +185,7 @@ class Engine:
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Engine]:
     monkeypatch.setattr("skytether.node.removals.Cgroups", lambda: Cgroups(tmp_path))  # those of this machine's own
+    monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
         made = Engine(Path(folder) / "e.sock")
         yield made
@@ -238,10 +240,10 @@ def test_what_is_passed_on_is_written_anew_and_asks_for_no_other_protocol(engine
     sent = request("GET /v1.41/info") + request(f"POST /v1.41/containers/{ID}/update", body, *odd)
     assert say(engine, sent).count(b"HTTP/1.1 200") == 2
     looked = {f"GET /containers/{ID}/json", "GET /v1.41/info"}
-    asked = [line for line in engine.lines[:-1] if "/containers/json?" not in line]  # what runs already
-    assert sorted(asked) == sorted(looked)  # which of them first, the engine's threads say
-    assert engine.lines[-1] == f"POST /v1.41/containers/{ID}/update"
-    _, headers, got = engine.asked[-1]
+    asked = [one for one in engine.asked if "/containers/json?" not in one[0]]  # what runs already
+    assert sorted(line for line, *_ in asked[:-1]) == sorted(looked)  # which first, the engine's threads say
+    line, headers, got = asked[-1]
+    assert line == f"POST /v1.41/containers/{ID}/update"
     assert {name.lower() for name in headers} == {"host", "content-length", "content-type"}
     assert got == b'{"Memory": 2}'
 
@@ -889,7 +891,7 @@ def test_a_program_that_was_just_started_has_nobody_ended_whose_network_another_
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its network was then looked up by the number of a process that had ended: another one could have that by then."""
-    monkeypatch.setattr("skytether.node.removals._WAIT_S", 0.2)
+    monkeypatch.setattr("skytether.node.joins._WAIT_S", 0.2)
     joins = {"HostConfig": {"ReadonlyRootfs": True, "NetworkMode": f"container:{X}"}, "Mounts": []}
     engine.running, engine.paused, engine.others = {X, Z}, {X}, {X: in_volumes("skytether-s"), Z: joins}
     engine.slow = {f"POST /containers/{X}/unpause": threading.Event()}
@@ -1211,6 +1213,61 @@ def test_who_joins_what_was_there_before_waits_until_no_call_of_an_earlier_progr
     asyncio.run(run())
 
 
+def test_who_has_a_volume_with_a_name_waits_until_no_call_of_an_earlier_program_can_remove_it(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was asked for while nobody ran, and waited; it began when one had given a folder of it away, and had ended."""
+    engine.others = {X: in_volumes(OWN), Y: in_volumes("skytether-s")}
+    monkeypatch.setattr("skytether.node.removals._QUIET_S", 1.0)
+
+    async def run() -> None:
+        began, site = time.monotonic(), Site(engine)
+        await site.start(X)
+        assert time.monotonic() - began < 1.0, "by the name of its volume nobody asks for that"
+        await site.start(Y)
+        assert time.monotonic() - began >= 1.0
+
+    asyncio.run(run())
+
+
+def test_what_an_earlier_program_paused_after_the_list_was_told_goes_on(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That waited at the engine, and the container stayed paused until it was removed."""
+    engine.others, engine.running = {X: in_volumes()}, {X}
+    monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.5)
+    unpause = f"POST /containers/{X}/unpause"
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.gate.look_back()
+        engine.paused = {X}
+        await asyncio.sleep(0.2)
+        assert unpause not in engine.lines
+        await site.soon(unpause)
+
+    asyncio.run(run())
+
+
+def test_little_is_put_into_one_container_at_a_time(engine: Engine) -> None:
+    """Eighty archives held up its start for 6 s, and others at the engine."""
+    engine.others = {X: {"State": {"Status": "created"}, "Mounts": []}}
+    line = f"PUT /containers/{X}/archive?path=/run"
+    engine.slow = {line: threading.Event()}
+
+    async def run() -> None:
+        calls = Removals(engine.path)
+        puts = [asyncio.create_task(calls.put(X, line.removeprefix("PUT "), b"", "")) for _ in range(8)]
+        while calls._puts[X] < 8:  # noqa: SLF001 how many there are
+            await asyncio.sleep(0.01)
+        with pytest.raises(BusyError, match="too much is being put"):
+            await calls.put(X, line.removeprefix("PUT "), b"", "")
+        engine.slow[line].set()
+        assert all(await asyncio.gather(*puts))
+
+    asyncio.run(run())
+
+
 def test_where_the_engine_does_not_list_what_is_there_a_start_may_wait_for_each(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1252,7 +1309,7 @@ def test_calls_by_which_one_container_may_end_are_few_at_a_time(engine: Engine) 
     """Each waits for its lock at the engine, and so does whoever asks whether it runs."""
 
     async def run() -> None:
-        calls, goes_on = Removals(engine.path), asyncio.Event()
+        calls, goes_on = Joins(engine.path), asyncio.Event()
         asks = [asyncio.create_task(calls.end(X, goes_on.wait)) for _ in range(16)]
         while calls._ending[X] < 16:  # noqa: SLF001 how many there are
             await asyncio.sleep(0.01)
@@ -1363,7 +1420,7 @@ def test_whose_network_is_joined_is_paused_meanwhile_and_not_ended(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the number of its process an engine names the network: once that has ended, one of the machine may have it."""
-    monkeypatch.setattr("skytether.node.removals._WAIT_S", 0.2)
+    monkeypatch.setattr("skytether.node.joins._WAIT_S", 0.2)
     engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}"), Z: in_volumes(network=f"container:{X}")}
 
     async def run() -> None:

@@ -129,7 +129,8 @@ def gate_at(path: str) -> Iterator[None]:
 
 
 @pytest.fixture
-def gated(docker_engine: str) -> Iterator[Gated]:
+def gated(docker_engine: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gated]:
+    monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
         path, name = str(Path(folder) / "gate.sock"), f"skytether-kin-{secrets.token_hex(4)}"
         with gate_at(path):

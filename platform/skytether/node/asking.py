@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Coroutine
 from http import HTTPStatus
-from typing import Any
+from typing import Any, TypeVar
 
 from .machine import Answer, ask_soon, lean
 
+_T = TypeVar("_T")
 JSON, TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
+_GOING: set[asyncio.Task[Any]] = set()
+"""A loop itself keeps no task that waits: it would be thrown away, if nobody else knows it."""
 
 
 class RefusedCall(Exception):  # noqa: N818 (an answer)
@@ -42,3 +47,12 @@ class Asking:
             return answer.status, lean(answer.content)
         except ValueError as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+
+
+def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
+    """A task that goes on whoever waits for it, and whose failure need not be read."""
+    task = asyncio.create_task(work)
+    _GOING.add(task)
+    task.add_done_callback(_GOING.discard)
+    task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
+    return task

@@ -22,7 +22,7 @@ from skytether.api.printable import printable
 from skytether.api.splice import PIECE, Stream
 
 from .archives import cleaned
-from .asking import JSON, Asking, RefusedCall
+from .asking import JSON, Asking, RefusedCall, begun
 from .engine_rules import (
     FOLDER,
     MADE,
@@ -41,10 +41,11 @@ from .engine_rules import (
     published,
 )
 from .files import Files
+from .joins import BusyError
 from .machine import ANYWHERE, Answer, ask_long, free_port, is_taken, listed
 from .pulls import AUTH, Pulls
 from .registries import Registries
-from .removals import BusyError, Removals, begun
+from .removals import Removals
 from .store import NodeStore
 
 log = logging.getLogger(__name__)

@@ -10,9 +10,9 @@ from http import HTTPStatus
 from urllib.parse import urlencode
 
 from .archives import leads_straight, misleads, must_be_read, pull_stat
+from .asking import begun
 from .engine_rules import LOOK, NOBODY, OWNER
 from .machine import ask_long
-from .removals import begun
 
 _KNOWN = 4096
 _MOST_LOOKS, _LOOK_S = 64, 30.0

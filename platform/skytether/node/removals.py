@@ -14,14 +14,17 @@ import logging
 import re
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Container, Coroutine, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Collection, Container, Iterable, Mapping
+from functools import partial
 from http import HTTPStatus
 from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
+from .asking import begun
 from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
+from .joins import BusyError, Joins
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
 
@@ -35,15 +38,14 @@ _WAIT_S = 30.0
 _SETTLED_S = 3.0
 """For an engine to say what a container is that it does not start just now."""
 _QUIET_S = 15.0
-"""For what an earlier program asked for to begin at the engine: starts, and what ends a container. Of what ends one
-there are few, and an engine is at these in turn."""
-_GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
-"""Between tries to have a container go on that was paused."""
+"""For what an earlier program asked for to begin at the engine: starts, removals, and what pauses or ends a container.
+Of what ends one there are few, and an engine is at these in turn."""
+_LIST_AGAIN_S = 60.0
 _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
-_MOST_STARTS, _MOST_REMOVALS, _MOST_JOIN, _MOST_ENDING = 512, 128, 4, 16
-"""Under way at a time, in line for one network, and by which one container may end: an engine may take its time for
-each, and whoever asked may be gone meanwhile."""
+_MOST_STARTS, _MOST_REMOVALS, _MOST_PUTS = 512, 128, 8
+"""Under way at a time, the last into one container: an engine may take its time for each, and whoever asked may be gone
+meanwhile."""
 _MOST_MINE = 1 << 15
 _MOST_TOLD = 100
 _MOST_ASKED = 32
@@ -51,17 +53,8 @@ _MOST_ASKED = 32
 _MODE = "HostConfig.NetworkMode"
 _OURS = urlencode({"all": "1", "filters": json.dumps({"label": [OWNER]})})
 """What asks an engine for all containers of orchestrators."""
-_ENDS = "the container whose network it joins is being ended"
 _VOLUME = "volume "
 """What volumes are known by, before their names: they may be named as containers are."""
-
-
-_GOING: set[asyncio.Task[Any]] = set()
-"""A loop itself keeps no task that waits: it would be thrown away, if nobody else knows it."""
-
-
-class BusyError(Exception):
-    """It is not done now; in a sentence."""
 
 
 class Removals:
@@ -95,12 +88,7 @@ class Removals:
         """
         self._puts: Counter[str] = Counter()
         """How much is being put into each container."""
-        self._joined: Counter[str] = Counter()
-        """How many join the network of each just now."""
-        self._pauses: dict[str, asyncio.Lock] = {}
-        """They do one at a time."""
-        self._ending: Counter[str] = Counter()
-        """Of calls by which a container may end."""
+        self._joins = Joins(engine)
         self._told: set[str] = set()
         """Containers of whose processes it was told that they go on."""
         self._noted = 0
@@ -110,13 +98,15 @@ class Removals:
 
     async def start(self, container: str, inspected: Mapping[str, Any], path: str) -> Answer:
         """Have the engine start one, which is kin of what it shares something with from now on."""
-        things, joins = (container, *_volumes(inspected), *_joined(inspected)), _joined(inspected)
+        volumes, joins = _volumes(inspected), _joined(inspected)
+        things = (container, *volumes, *joins)
         del inspected  # it may be large, and from here on much is waited for
         await self._know_old()
         if self._is_old(container):  # what an earlier program was asked for may meet it as it runs
             text = f"container {container} was there before this node's program began: remove it, and make another"
             return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
-        if any(map(self._is_old, joins)):  # an earlier program may have been asked to end it
+        # An earlier program may have been asked to end it, or to remove it.
+        if any(map(self._is_old, joins)) or any(not _OWN.fullmatch(one.removeprefix(_VOLUME)) for one in volumes):
             await asyncio.sleep(self._quiet_from - time.monotonic())
         if not self._kin.lost and not self._kin.has_room(things):
             await self._forget_ended()
@@ -126,83 +116,23 @@ class Removals:
             raise BusyError("too many containers start")
         if self._puts[container]:
             raise BusyError("something is being put into it")
-        (joined,) = joins or ("",)
-        if joined in self._ending:
-            raise BusyError(_ENDS)
-        if joined and container not in self._starts and self._joined[joined] >= _MOST_JOIN:
-            raise BusyError("too many containers join that network just now")
+        for joined in joins:
+            self._joins.may_join(joined, new=container not in self._starts)
         self._kin.meet(things)
         self._mine.add(container)
         if len(self._mine) > _MOST_MINE:
             self._mine &= self._kin.all() | self._starts.keys() | {container}
         self._noted += 1
         if (task := self._starts.get(container)) is None:
-            if joined:
-                self._joined[joined] += 1
-            task = self._starts[container] = begun(self._start(path, joined))
+            task = self._joins.start(path, *joins) if joins else begun(ask_long(self._engine, path, method="POST"))
+            self._starts[container] = task
             task.add_done_callback(lambda _: self._starts.pop(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
 
-    async def _start(self, path: str, joined: str) -> Answer:
-        """With the one whose network it joins paused meanwhile; empty: it has its own.
-
-        An engine names that network by the number of a process. If that ended before runc looks, another process could
-        have its number: one of the machine, whose network the container would be in.
-        """
-        if not joined:
-            return await ask_long(self._engine, path, method="POST")
-        try:
-            async with self._pauses.setdefault(joined, asyncio.Lock()):
-                if joined in self._ending:
-                    raise BusyError(_ENDS)
-                held = None
-                try:
-                    held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
-                    if held.status >= HTTPStatus.BAD_REQUEST:
-                        return held  # it has ended, or is about to, or somebody else has it paused
-                    return await ask_long(self._engine, path, method="POST")
-                finally:
-                    if held is None or held.status < HTTPStatus.BAD_REQUEST:
-                        await self._go_on(joined)
-        finally:
-            self._has_joined(joined)
-
-    def _has_joined(self, joined: str) -> None:
-        self._joined[joined] -= 1
-        if not self._joined[joined]:
-            del self._joined[joined], self._pauses[joined]
-
-    async def _go_on(self, container: str) -> None:
-        for wait_s in _GO_ON_S:
-            await asyncio.sleep(wait_s)
-            with contextlib.suppress(OSError, ValueError):
-                answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
-                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
-                    return
-        log.error("container %s stays paused: docker unpause %s", container, container)
-
     async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
-        """Have something done by which a container may end, which it must not while another one joins its network.
-
-        Who joins it just now is waited for; who wants to, does not any more.
-        """
+        """See `Joins.end`."""
         await self.look_back()
-        if self._ending[container] >= _MOST_ENDING:
-            raise BusyError("too much is asked of that container just now")
-        self._ending[container] += 1
-        try:
-            if (joining := self._pauses.get(container)) is not None:
-                try:
-                    async with asyncio.timeout(_WAIT_S):
-                        await joining.acquire()
-                except TimeoutError:
-                    raise BusyError("another container is just joining its network") from None
-                joining.release()
-            return await work()
-        finally:
-            self._ending[container] -= 1
-            if not self._ending[container]:
-                del self._ending[container]
+        return await self._joins.end(container, work)
 
     async def put(self, container: str, path: str, archive: bytes, own: str = "") -> Answer | None:
         """Have the engine unpack an archive in one that was never started; None: it was, or has no such volume.
@@ -222,6 +152,8 @@ class Removals:
         del answer  # it may be large, and the engine may take any time
         if container in self._mine or self._is_old(container) or not takes:
             return None
+        if self._puts[container] >= _MOST_PUTS:
+            raise BusyError("too much is being put into it")
         self._puts[container] += 1
         task = begun(ask_long(self._engine, path, method="PUT", body=archive))
         task.add_done_callback(lambda _: self._has_put(container))
@@ -336,20 +268,38 @@ class Removals:
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
             old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
-            for paused in old:
-                if there[paused].get("State") != "paused" or paused in self._pauses:  # by a look that failed later
-                    continue
-                joining = [one for one in old if there[one].get(_MODE) == f"container:{paused}"]
-                self._joined[paused] += 1
-                self._pauses[paused] = asyncio.Lock()
-                await self._pauses[paused].acquire()
-                begun(self._unpause(paused, joining))  # an engine may never answer, if what runs there sees to that
+            await self._let_go_on({one: there[one] for one in old})
             if old := old | await self._going_on(there):
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
         except (TooMuchError, TimeoutError):  # it has so much that it takes long to tell
             self._kin.lose()
         self._looked_back = True
+
+    async def _let_go_on(self, old: Mapping[str, Mapping[str, Any]]) -> None:
+        """An earlier program may have ended while it had one paused, for others that joined its network."""
+        for paused in old:
+            if old[paused].get("State") == "paused":
+                joining = [one for one in old if old[one].get(_MODE) == f"container:{paused}"]
+                await self._joins.let_go_on(paused, partial(self._until_joined, joining))
+
+    async def _until_joined(self, joining: Iterable[str]) -> None:
+        for one in joining:
+            while await self._runs(one) is False and time.monotonic() < self._quiet_from:
+                await asyncio.sleep(_SETTLED_S)
+            while not await self._is_told_of(one):
+                await asyncio.sleep(_SETTLED_S)
+
+    async def _look_again(self) -> None:
+        """When all has begun that an earlier program asked for: it may have paused one after the list was told."""
+        while True:
+            await asyncio.sleep(self._quiet_from - time.monotonic())
+            try:
+                there = {one["Id"]: one for one in await self._containers()}
+            except (OSError, ValueError):
+                await asyncio.sleep(_LIST_AGAIN_S)
+            else:
+                return await self._let_go_on({one: there[one] for one in there if self._is_old(one)})
 
     def _is_left(self, container: Mapping[str, Any]) -> bool:
         """Whether an earlier program made it to look at an image, and had no time to remove it; then it is removed."""
@@ -358,19 +308,6 @@ class Removals:
         if left:
             begun(ask_long(self._engine, f"/containers/{container['Id']}?force=1&v=1", method="DELETE"))
         return bool(left)
-
-    async def _unpause(self, container: str, joining: Iterable[str]) -> None:
-        """An earlier program may have ended while it had it paused, for others that joined its network."""
-        try:
-            for one in joining:
-                while await self._runs(one) is False and time.monotonic() < self._quiet_from:
-                    await asyncio.sleep(_SETTLED_S)
-                while not await self._is_told_of(one):
-                    await asyncio.sleep(_SETTLED_S)
-            await self._go_on(container)
-        finally:
-            self._pauses[container].release()
-            self._has_joined(container)
 
     async def _running(self, things: Iterable[str]) -> set[str]:
         """Those of these containers that run, or may."""
@@ -479,16 +416,8 @@ class Removals:
         if self._old is None:  # the first that is told: at the look back it may have been too much
             self._old = {one["Id"] for one in there}
             self._quiet_from = time.monotonic() + _QUIET_S
+            begun(self._look_again())
         return there
-
-
-def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
-    """A task that goes on whoever waits for it, and whose failure need not be read."""
-    task = asyncio.create_task(work)
-    _GOING.add(task)
-    task.add_done_callback(_GOING.discard)
-    task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
-    return task
 
 
 def _takes_files(content: bytes, own: str) -> bool:

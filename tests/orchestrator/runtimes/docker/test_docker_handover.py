@@ -39,7 +39,7 @@ class Scene:
     def asked(self) -> Any:
         return nullcontext()
 
-    def api(self) -> Any:
+    def api(self, _timeout_s: float | None = None) -> Any:
         return self
 
     def inspect_image(self, _image: str) -> dict[str, Any]:

@@ -1,0 +1,136 @@
+"""A container whose network another one joins is paused meanwhile, and not ended.
+
+An engine names that network by the number of a process. If that ended before runc looks, another process could have its
+number: one of the machine, whose network the container would be in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from http import HTTPStatus
+from typing import TypeVar
+
+from .asking import begun
+from .machine import Answer, ask_long
+
+log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+_WAIT_S = 30.0
+"""For those that just join, before one is ended."""
+_GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
+"""Between tries to have a container go on that was paused."""
+_MOST_JOIN, _MOST_ENDING = 4, 16
+"""In line for one network, and calls under way by which one container may end: an engine may take its time for each,
+and whoever asked may be gone meanwhile."""
+_ENDS = "the container whose network it joins is being ended"
+
+
+class BusyError(Exception):
+    """It is not done now; in a sentence."""
+
+
+class Joins:
+    """Of one engine."""
+
+    def __init__(self, engine: str) -> None:
+        """``engine``: path of its socket."""
+        self._engine = engine
+        self._joined: Counter[str] = Counter()
+        """How many join the network of each just now."""
+        self._pauses: dict[str, asyncio.Lock] = {}
+        """They do one at a time."""
+        self._ending: Counter[str] = Counter()
+        """Of calls by which a container may end."""
+
+    def may_join(self, joined: str, *, new: bool) -> None:
+        """Raises `BusyError` where no container joins the network of that one now; ``new``: nor is it about to."""
+        if joined in self._ending:
+            raise BusyError(_ENDS)
+        if new and self._joined[joined] >= _MOST_JOIN:
+            raise BusyError("too many containers join that network just now")
+
+    def start(self, path: str, joined: str) -> asyncio.Task[Answer]:
+        """Have the engine start one by ``path``, with the one paused whose network it joins."""
+        self._joined[joined] += 1
+        return begun(self._start(path, joined))
+
+    async def _start(self, path: str, joined: str) -> Answer:
+        try:
+            async with self._pauses.setdefault(joined, asyncio.Lock()):
+                if joined in self._ending:
+                    raise BusyError(_ENDS)
+                held = None
+                try:
+                    held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
+                    if held.status >= HTTPStatus.BAD_REQUEST:
+                        return held  # it has ended, or is about to, or somebody else has it paused
+                    return await ask_long(self._engine, path, method="POST")
+                finally:
+                    if held is None or held.status < HTTPStatus.BAD_REQUEST:
+                        await self._go_on(joined)
+        finally:
+            self._has_joined(joined)
+
+    def _has_joined(self, joined: str) -> None:
+        self._joined[joined] -= 1
+        if not self._joined[joined]:
+            del self._joined[joined], self._pauses[joined]
+
+    async def _go_on(self, container: str) -> None:
+        for wait_s in _GO_ON_S:
+            await asyncio.sleep(wait_s)
+            with contextlib.suppress(OSError, ValueError):
+                answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
+                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
+                    return
+        log.error("container %s stays paused: docker unpause %s", container, container)
+
+    async def let_go_on(self, container: str, joining: Callable[[], Awaitable[None]]) -> None:
+        """Have one go on, later, that an earlier program may have paused; nobody joins its network, or ends it, before.
+
+        Args:
+            container: Its id.
+            joining: Waits for those that joined its network then. The engine may never let it end, if what runs there
+                sees to that.
+        """
+        if container in self._pauses:  # it was paused for who joins just now, or has been let go on already
+            return
+        lock = self._pauses[container] = asyncio.Lock()
+        self._joined[container] += 1
+        await lock.acquire()
+        begun(self._go_on_after(container, joining))
+
+    async def _go_on_after(self, container: str, joining: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await joining()
+            await self._go_on(container)
+        finally:
+            self._pauses[container].release()
+            self._has_joined(container)
+
+    async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
+        """Have something done by which a container may end, which it must not while another one joins its network.
+
+        Who joins it just now is waited for; who wants to, does not any more.
+        """
+        if self._ending[container] >= _MOST_ENDING:
+            raise BusyError("too much is asked of that container just now")
+        self._ending[container] += 1
+        try:
+            if (joining := self._pauses.get(container)) is not None:
+                try:
+                    async with asyncio.timeout(_WAIT_S):
+                        await joining.acquire()
+                except TimeoutError:
+                    raise BusyError("another container is just joining its network") from None
+                joining.release()
+            return await work()
+        finally:
+            self._ending[container] -= 1
+            if not self._ending[container]:
+                del self._ending[container]
