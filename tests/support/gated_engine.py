@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
 import json
 import secrets
 import tempfile
@@ -131,7 +132,11 @@ def gate_at(path: str) -> Iterator[None]:
 @pytest.fixture
 def gated(docker_engine: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gated]:
     monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
-    with tempfile.TemporaryDirectory(prefix="sky-") as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="sky-") as folder,
+        (Path(tempfile.gettempdir()) / "sky-gated").open("w") as one,
+    ):
+        fcntl.flock(one, fcntl.LOCK_EX)  # another gate that begins takes what this one looks at for left behind
         path, name = str(Path(folder) / "gate.sock"), f"skytether-kin-{secrets.token_hex(4)}"
         with gate_at(path):
             made = Gated(path, name)

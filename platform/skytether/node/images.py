@@ -17,6 +17,8 @@ from .machine import ask_long
 _KNOWN = 4096
 _MOST_LOOKS, _LOOK_S = 64, 30.0
 """At a time, and how long each is waited for [s]."""
+_LOOK_TIMES = 2
+"""Another program of a node that begins at this engine takes what is made for a look for left behind, once."""
 
 _Found = dict[tuple[str, str], bool]
 
@@ -64,7 +66,14 @@ class Images:
         return next((path for path in wanted if found[image, path]), None)
 
     async def _look(self, image: str, paths: Iterable[str], mounts: Iterable[str]) -> _Found:
-        """A container is made of it, and never started: nothing moves there."""
+        for _ in range(_LOOK_TIMES):
+            if (found := await self._look_once(image, paths, mounts)) is not None:
+                self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
+                return found
+        raise ValueError("what was made of its image was removed meanwhile")
+
+    async def _look_once(self, image: str, paths: Iterable[str], mounts: Iterable[str]) -> _Found | None:
+        """A container is made of it, and never started: nothing moves there. None: somebody removed that meanwhile."""
         body = {
             "Image": image,
             "Entrypoint": ["/never-started"],
@@ -87,10 +96,7 @@ class Images:
         except BaseException:
             await self._remove(container)
             raise
-        if not await self._remove(container):
-            raise ValueError("what was made of its image was removed meanwhile")  # and nothing was found there
-        self._known = {**(self._known if len(self._known) < _KNOWN else {}), **found}
-        return found
+        return found if await self._remove(container) else None  # or nothing was found because nothing was there
 
     async def _remove(self, container: str) -> bool:
         removed = await ask_long(self._engine, f"/containers/{container}?force=1&v=1", method="DELETE")
