@@ -21,6 +21,7 @@ from skytether.orchestrator.runtimes.docker import runtime as module
 from skytether.orchestrator.runtimes.docker.engine import EngineGoneError
 from skytether.orchestrator.runtimes.docker.fence import Fence
 from skytether.orchestrator.runtimes.docker.follow import Follower
+from skytether.orchestrator.runtimes.docker.launch import START_S
 from skytether.orchestrator.runtimes.docker.objects import EPOCH, OWNER
 from skytether.orchestrator.runtimes.docker.options import DockerOptions
 
@@ -108,7 +109,7 @@ class Frozen:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runtime: DockerRuntime) -> None:
         self.reached, self.go_on = threading.Event(), threading.Event()
-        api = runtime.engine.api()
+        api = runtime.engine.api(START_S)
         begin = api.start
 
         def start(container: str) -> None:

@@ -33,7 +33,7 @@ _KEPT = 2
 """Earlier runs whose containers stay, for their logs."""
 _END_S = 10.0
 """Seconds that a killed container gets to be gone."""
-_START_S = 30.0
+START_S = 30.0
 """For an engine to start one: a node whose program was just started holds some starts for up to 15 s."""
 _AGAIN_S = 0.05
 """Between two attempts to have a name that a container which is just removed still has."""
@@ -128,7 +128,7 @@ class Job:
         try:
             if self._before is not None:
                 self._before.cancel()
-                self._before.join(_END_S + _START_S + self._options.timeout_s)
+                self._before.join(_END_S + START_S + self._options.timeout_s)
                 self._before = None
             begun = self._clear()
             cleared = True
@@ -348,7 +348,7 @@ class Job:
                 self._go_on()
                 self._must_lead()  # now that it is there for a later leader to see
                 begun = True  # or will be, whatever comes of the call
-                self._engine.api(max(_START_S, self._options.timeout_s)).start(made)
+                self._engine.api(max(START_S, self._options.timeout_s)).start(made)
                 seen = self._follower.inspect(made)
                 if guard is not None:
                     self._connect(guard, made, openings)
