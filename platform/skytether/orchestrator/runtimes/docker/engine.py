@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -88,11 +88,11 @@ class Engine:
             pair = (tls.cert, tls.key)
             arguments["tls"] = TLSConfig(client_cert=pair, ca_cert=tls.ca, verify=True)
             address = address.replace("tcp://", "https://", 1)
-        first = Client(address, version=_OLDEST, **arguments)
-        try:
+        known = next(iter(self._clients.values()), None)
+        if known is not None:  # nobody waits for the engine, with the lock, to hear the same again
+            return Client(address, version=known.api_version, **arguments)
+        with closing(Client(address, version=_OLDEST, **arguments)) as first:
             version = str(first.version(api_version=False)["ApiVersion"])
-        finally:
-            first.close()
         return Client(address, version=version, **arguments)
 
     def drop(self) -> None:
