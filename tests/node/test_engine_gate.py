@@ -185,6 +185,7 @@ class Engine:
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Engine]:
     monkeypatch.setattr("skytether.node.removals.Cgroups", lambda: Cgroups(tmp_path))  # those of this machine's own
+    monkeypatch.setattr("skytether.node.joins.Cgroups", lambda: Cgroups(tmp_path))
     monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
         made = Engine(Path(folder) / "e.sock")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Coroutine
 from http import HTTPStatus
 from typing import Any, TypeVar
@@ -56,3 +57,8 @@ def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:
     task.add_done_callback(_GOING.discard)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())  # whoever asked may be gone
     return task
+
+
+def conflict(text: str) -> Answer:
+    """What an engine would say that refuses something now, in a sentence."""
+    return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())

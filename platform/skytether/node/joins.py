@@ -1,7 +1,8 @@
 """A container whose network another one joins is paused meanwhile, and not ended.
 
 An engine names that network by the number of a process. If that ended before runc looks, another process could have its
-number: one of the machine, whose network the container would be in.
+number: one of the machine, whose network the container would be in. Where the memory of the machine is used up, the
+kernel ends what is paused, too: then who joined is ended at once.
 """
 
 from __future__ import annotations
@@ -12,26 +13,52 @@ import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
-from .asking import begun
-from .machine import Answer, ask_long
+from .asking import begun, conflict
+from .cgroups import Cgroups
+from .machine import Answer, ask_long, ask_soon, picked
 
 log = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 _WAIT_S = 30.0
 """For those that just join, before one is ended."""
-_GO_ON_S = (0.0, 0.1, 1.0, 5.0, 10.0)
-"""Between tries to have a container go on that was paused."""
+_TRY_S = (0.0, 0.1, 1.0, 5.0, 10.0)
+"""Between tries to have a container go on that was paused, or ended."""
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
 _ENDS = "the container whose network it joins is being ended"
+_ENDED = "the container whose network it joined ended meanwhile: it was ended, too"
 
 
 class BusyError(Exception):
     """It is not done now; in a sentence."""
+
+
+class Life(NamedTuple):
+    """Of a container, as long as it is the same."""
+
+    has_processes: bool
+    """By the kernel's word, where it can be seen: its first process is the last to go, and keeps its number so long."""
+    told: tuple[object, ...] | None
+    """What the engine says of it; None: nothing."""
+
+    def goes_on(self, now: Life) -> bool:
+        """Whether it has not ended since."""
+        return self.told is not None and self.told == now.told and now.has_processes >= self.has_processes
+
+
+async def life(engine: str, container: str) -> Life:
+    """Of a container that is there; ``engine``: path of its socket."""
+    try:
+        has_processes = (await asyncio.to_thread(Cgroups)).go_on(container)
+        answer = await ask_soon(engine, f"/containers/{container}/json")
+        state = picked(answer.content, "State", "Running", "Pid", "StartedAt")["State"]
+        return Life(has_processes, (state["Running"], state.get("Pid"), state.get("StartedAt")))
+    except (OSError, ValueError, LookupError, TypeError):
+        return Life(False, None)
 
 
 class Joins:
@@ -54,12 +81,16 @@ class Joins:
         if new and self._joined[joined] >= _MOST_JOIN:
             raise BusyError("too many containers join that network just now")
 
-    def start(self, path: str, joined: str) -> asyncio.Task[Answer]:
+    def is_joined(self, container: str) -> bool:
+        """Whether another one joins its network just now."""
+        return container in self._joined
+
+    def start(self, container: str, path: str, joined: str) -> asyncio.Task[Answer]:
         """Have the engine start one by ``path``, with the one paused whose network it joins."""
         self._joined[joined] += 1
-        return begun(self._start(path, joined))
+        return begun(self._start(container, path, joined))
 
-    async def _start(self, path: str, joined: str) -> Answer:
+    async def _start(self, container: str, path: str, joined: str) -> Answer:
         try:
             async with self._pauses.setdefault(joined, asyncio.Lock()):
                 if joined in self._ending:
@@ -69,7 +100,14 @@ class Joins:
                     held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if held.status >= HTTPStatus.BAD_REQUEST:
                         return held  # it has ended, or is about to, or somebody else has it paused
-                    return await ask_long(self._engine, path, method="POST")
+                    before = await life(self._engine, joined)
+                    try:
+                        started = await ask_long(self._engine, path, method="POST")
+                    finally:
+                        goes_on = before.goes_on(await life(self._engine, joined))
+                        if not goes_on:
+                            await self.end_joined(container)
+                    return started if goes_on else conflict(_ENDED)
                 finally:
                     if held is None or held.status < HTTPStatus.BAD_REQUEST:
                         await self._go_on(joined)
@@ -81,8 +119,19 @@ class Joins:
         if not self._joined[joined]:
             del self._joined[joined], self._pauses[joined]
 
+    async def end_joined(self, container: str) -> None:
+        """End one that may be in another network than the one that it was to join."""
+        for wait_s in _TRY_S:
+            await asyncio.sleep(wait_s)
+            with contextlib.suppress(OSError, ValueError):
+                answer = await ask_long(self._engine, f"/containers/{container}/kill?signal=KILL", method="POST")
+                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR:  # or it does not run
+                    log.warning("container %s was ended: the one whose network it joined ended meanwhile", container)
+                    return
+        log.error("container %s may be in the network of this machine: docker kill %s", container, container)
+
     async def _go_on(self, container: str) -> None:
-        for wait_s in _GO_ON_S:
+        for wait_s in _TRY_S:
             await asyncio.sleep(wait_s)
             with contextlib.suppress(OSError, ValueError):
                 answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")

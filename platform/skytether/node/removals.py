@@ -21,10 +21,10 @@ from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
-from .asking import begun
+from .asking import begun, conflict
 from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
-from .joins import BusyError, Joins
+from .joins import BusyError, Joins, life
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
 
@@ -41,6 +41,8 @@ _QUIET_S = 15.0
 """For what an earlier program asked for to begin at the engine: starts, removals, and what pauses or ends a container.
 Of what ends one there are few, and an engine is at these in turn."""
 _LIST_AGAIN_S = 60.0
+_IDLE_S = 0.5
+"""Between looks at one that may be about to start."""
 _OWN = re.compile("[0-9a-f]{64}")
 """Names of volumes that one container has, and no other can ask for."""
 _MOST_STARTS, _MOST_REMOVALS, _MOST_PUTS = 512, 128, 8
@@ -104,7 +106,7 @@ class Removals:
         await self._know_old()
         if self._is_old(container):  # what an earlier program was asked for may meet it as it runs
             text = f"container {container} was there before this node's program began: remove it, and make another"
-            return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
+            return conflict(text)
         # An earlier program may have been asked to end it, or to remove it.
         if any(map(self._is_old, joins)) or any(not _OWN.fullmatch(one.removeprefix(_VOLUME)) for one in volumes):
             await asyncio.sleep(self._quiet_from - time.monotonic())
@@ -116,6 +118,8 @@ class Removals:
             raise BusyError("too many containers start")
         if self._puts[container]:
             raise BusyError("something is being put into it")
+        if self._joins.is_joined(container):  # who joins it could not be told from one that joins what was before it
+            raise BusyError("another container is just joining its network")
         for joined in joins:
             self._joins.may_join(joined, new=container not in self._starts)
         self._kin.meet(things)
@@ -124,14 +128,18 @@ class Removals:
             self._mine &= self._kin.all() | self._starts.keys() | {container}
         self._noted += 1
         if (task := self._starts.get(container)) is None:
-            task = self._joins.start(path, *joins) if joins else begun(ask_long(self._engine, path, method="POST"))
+            if joins:
+                task = self._joins.start(container, path, *joins)
+            else:
+                task = begun(ask_long(self._engine, path, method="POST"))
             self._starts[container] = task
             task.add_done_callback(lambda _: self._starts.pop(container))
         return await asyncio.shield(task)  # it goes on at the engine, whoever waits for it
 
     async def end(self, container: str, work: Callable[[], Awaitable[_T]]) -> _T:
         """See `Joins.end`."""
-        await self.look_back()
+        with contextlib.suppress(TooMuchError):  # what is too much to list is to be ended still
+            await self._know_old()
         return await self._joins.end(container, work)
 
     async def put(self, container: str, path: str, archive: bytes, own: str = "") -> Answer | None:
@@ -192,7 +200,7 @@ class Removals:
         if (removed := await self._removed((_VOLUME + volume,), path, named=named)) is not None:
             return removed
         text = f"remove {volume}: volume is in use: containers run that may have a folder of it open, or go on"
-        return Answer(HTTPStatus.CONFLICT, {}, json.dumps({"message": text}).encode())
+        return conflict(text)
 
     async def _removed(self, things: Collection[str], path: str, *, named: bool = False) -> Answer | None:
         """What the engine says to a removal; None: others run, and it was asked for none.
@@ -268,7 +276,6 @@ class Removals:
         try:
             there = {one["Id"]: one for one in await self._containers() if not self._is_left(one)}
             old = {one for one in there if time.monotonic() > asked_until or await self._may_run(one)}
-            await self._let_go_on({one: there[one] for one in old})
             if old := old | await self._going_on(there):
                 volumes = await asyncio.to_thread(listed, self._engine, "/volumes", ["Volumes.item"], ["Name"])
                 self._kin.meet([*old, *(f"{_VOLUME}{one['Name']}" for one in volumes)])
@@ -277,18 +284,41 @@ class Removals:
         self._looked_back = True
 
     async def _let_go_on(self, old: Mapping[str, Mapping[str, Any]]) -> None:
-        """An earlier program may have ended while it had one paused, for others that joined its network."""
-        for paused in old:
-            if old[paused].get("State") == "paused":
-                joining = [one for one in old if old[one].get(_MODE) == f"container:{paused}"]
-                await self._joins.let_go_on(paused, partial(self._until_joined, joining))
+        """An earlier program may have ended while it had some paused, for others that joined their networks."""
+        joining, asked_until = dict[str, list[str]](), time.monotonic() + _LOOK_BACK_S
+        for one in old:
+            joining.setdefault(str(old[one].get(_MODE)).removeprefix("container:"), []).append(one)
+        for container in old:
+            joins, paused = joining.get(container, []), old[container].get("State") == "paused"
+            if joins and not paused:  # so a list says, where the engine could not write down that it is
+                paused = time.monotonic() > asked_until or await self._is_paused(container)
+            if paused:
+                await self._joins.let_go_on(container, partial(self._until_joined, container, joins))
 
-    async def _until_joined(self, joining: Iterable[str]) -> None:
+    async def _is_paused(self, container: str) -> bool:
+        """Whether it is, or may be."""
+        try:
+            answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+            return picked(answer.content, "State", "Paused")["State"]["Paused"] is not False
+        except (OSError, ValueError, LookupError, TypeError):
+            return True
+
+    async def _until_joined(self, container: str, joining: Iterable[str]) -> None:
+        """Wait until a container's network is not being joined any more; who joined another's by that is ended.
+
+        Args:
+            container: Its id.
+            joining: Those that are to be in its network.
+        """
+        before = await life(self._engine, container)
+        idle = {one for one in joining if await self._runs(one) is False}  # a start of theirs may be under way
         for one in joining:
             while await self._runs(one) is False and time.monotonic() < self._quiet_from:
-                await asyncio.sleep(_SETTLED_S)
+                await asyncio.sleep(_IDLE_S)
             while not await self._is_told_of(one):
                 await asyncio.sleep(_SETTLED_S)
+            if one in idle and await self._runs(one) and not before.goes_on(await life(self._engine, container)):
+                await self._joins.end_joined(one)
 
     async def _look_again(self) -> None:
         """When all has begun that an earlier program asked for: it may have paused one after the list was told."""
@@ -414,8 +444,9 @@ class Removals:
         keys = ("Id", "State", _MODE, "Names.item", f"Labels.{OWNER}", "Created")
         there = await asyncio.to_thread(listed, self._engine, f"/containers/json?{_OURS}", ["item"], keys)
         if self._old is None:  # the first that is told: at the look back it may have been too much
-            self._old = {one["Id"] for one in there}
             self._quiet_from = time.monotonic() + _QUIET_S
+            await self._let_go_on({one["Id"]: one for one in there})
+            self._old = {one["Id"] for one in there}
             begun(self._look_again())
         return there
 
