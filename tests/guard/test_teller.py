@@ -260,16 +260,37 @@ def test_who_takes_over_tells_one_who_came_meanwhile_to_stand_first(both):
     assert second.wheels.told == [STANDSTILL]
 
 
-def test_who_takes_over_goes_on_where_the_other_one_has_told_who_came(both):
+@pytest.mark.parametrize("soon", [True, False])
+def test_who_takes_over_goes_on_where_the_other_one_has_told_who_came(both, soon):
+    """Unless that was just now: the connection to the gate was there 0.25 s sooner, as a packet was lost.
+
+    The writer told a recorder full speed meanwhile, and was killed; the wheels heard that from the gate first.
+    """
     first, second = both
     for one in (first, second):
         one.wheels.nodes = frozenset({"/base again"})
-    second.turn(0.99)
+    second.turn(0.99 if soon else -8.0)
     for i in range(16):
         first.turn(1.0 + i * PERIOD, FAST)
     assert not second.turn(1.335)
     assert second.turn(1.351)
-    assert second.wheels.told[-1].linear == pytest.approx(0.3 - 2.0 * 0.051)
+    assert second.wheels.told[-1].linear == pytest.approx(0.0 if soon else 0.3 - 2.0 * 0.051)
+
+
+def test_who_comes_to_one_that_is_silent_meanwhile_hears_a_standstill_first_of_it(both):
+    """A subscription was made anew after 20 ms: for a turn nobody listened to the writer, and the gate claimed.
+
+    It was taken for one that the other one tells, and heard full speed, which went on.
+    """
+    first, second = both
+    for i in range(3):
+        first.turn(1.0 + i * PERIOD, FAST)
+    first.wheels.nodes = frozenset()
+    first.turn(1.06, FAST)
+    first.board.put(Role.SECOND, Entry(LastCommand(FAST, 1.07), left_at=1.07))  # perhaps nobody heard it
+    first.wheels.nodes = frozenset({"/base again"})
+    first.turn(1.08, FAST)
+    assert first.wheels.told[3:] == [STANDSTILL]
 
 
 def test_what_could_not_be_published_the_wheels_were_not_told_and_are_told_to_stand_first(both):
@@ -360,8 +381,8 @@ def test_who_is_not_heard_leaves_it_to_the_other_one(both):
     for i in range(10, 14):
         first.turn(1.0 + i * PERIOD, FAST)
         second.turn(1.001 + i * PERIOD)
-    # They have been told something by the gate all the time, and go on from there.
-    assert first.wheels.told[1].linear == pytest.approx(second.wheels.told[-1].linear + 1.0 * 0.039)
+    # They may have been told something by the gate all the time, or may not: nobody knows.
+    assert [velocity.linear for velocity in first.wheels.told[1:3]] == pytest.approx([0.0, 0.02])
     assert second.wheels.told[-1].linear > 0
 
 

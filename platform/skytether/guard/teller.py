@@ -58,6 +58,8 @@ _LATER = 2
 """Periods. So much longer than by their own patience the wheels are left to stop: nobody saw the very moment."""
 _WRITTEN = 256
 """Velocities that are remembered: of the time within which it is seen that who sends them stands still."""
+_CONNECTS_S = 8.0
+"""For who listens to one of both to listen to the other one, too: TCP tries after 1, 3 and 7 s."""
 _AGAIN_S = 1.0
 """Between attempts on a way that is broken; meanwhile the other one speaks."""
 
@@ -142,10 +144,8 @@ class Teller:
         self._period_s = period_s
         self._clock = clock
         self._listeners: frozenset[str] | None = frozenset()
-        self._new = False
-        """Whether somebody listens, and nobody did in the turn before, as far as this one knew."""
         self._strangers_at = -inf
-        """When others came in the place of all who had listened [s]."""
+        """When others came in the place of all who had listened, or the first ones did [s]."""
         self._sent: Sent | None = None
         self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
         """The newest last."""
@@ -180,8 +180,7 @@ class Teller:
         if self._is_stuck():
             return
         known, self._listeners = self._listeners, self._wheels.listeners()
-        self._new = bool(self._listeners) and not known
-        if self._listeners and known and not known & self._listeners:
+        if self._listeners and not (known and known & self._listeners):
             self._strangers_at = now
 
     def write_velocity(self, now: float, stopped: bool = False) -> bool:
@@ -204,9 +203,8 @@ class Teller:
         unheard = self._is_stuck() or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
-        alone = self._new and not self._board.of(_OTHER[self._role]).told.at >= self._own.at
-        if alone or self._strangers_at > self._heard_at:
-            self._failed(now)  # they know nothing of what was told before, and nobody else has told them since
+        if not self._own.at >= self._strangers_at and now - self._strangers_at < _CONNECTS_S:
+            self._failed(now)  # they know nothing of what was told before, and perhaps the other one did not reach them
         if not stopped and self._waits(now):
             return False
         self.unread = self._wheels.unread()
