@@ -76,6 +76,8 @@ class Engine:
         """Containers, by their ids."""
         self.paused: set[str] = set()
         """Of those."""
+        self.unwritten = False
+        """A full disk: its list does not say that they are paused."""
         self.idle: set[str] = set()
         """Others that it has."""
         self.others: dict[str, dict[str, Any]] = {}
@@ -109,7 +111,8 @@ class Engine:
                 other = next((one for one in engine.others if one in self.path), None)
                 labels = {"skytether.io/owner": "edge"} if ID in self.path or other else {}
                 runs = any(one in self.path for one in engine.running)
-                state = {"Running": runs, "Status": "running" if runs else "created"}
+                paused = any(one in self.path for one in engine.paused)
+                state = {"Running": runs, "Status": "running" if runs else "created", "Paused": paused}
                 said = {"Id": ID, "Config": {"Labels": labels}, "Labels": labels, "Image": "a", **engine.container}
                 said["State"] = state
                 if other:
@@ -133,7 +136,7 @@ class Engine:
                             {
                                 **engine.others.get(one, {}),
                                 "Id": one,
-                                "State": "paused" if one in engine.paused else "running",
+                                "State": "paused" if one in engine.paused and not engine.unwritten else "running",
                             }
                             for one in there
                         ]
@@ -908,6 +911,63 @@ def test_a_program_that_was_just_started_has_nobody_ended_whose_network_another_
         async with asyncio.timeout(10):
             while b"200 OK" not in await site.ask(f"POST /v1.41/containers/{X}/kill?signal=KILL"):
                 await asyncio.sleep(0.01)
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("how", ["a full disk", "a late list"])
+def test_a_program_that_was_just_started_asks_who_is_paused(
+    engine: Engine, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The list said that it runs, or came too late: what joined its network was in that of whoever had its number."""
+    monkeypatch.setattr("skytether.node.joins._WAIT_S", 0.2)
+    monkeypatch.setattr("skytether.node.removals._QUIET_S", 1.0)
+    lists = machine.listed
+    engine.running, engine.paused, engine.unwritten = {X}, {X}, how == "a full disk"
+    engine.idle, engine.others = {Y}, {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+
+    def late(*asked: Any, **more: Any) -> Any:
+        monkeypatch.setattr("skytether.node.removals.listed", lists)
+        raise TimeoutError
+
+    if how == "a late list":
+        monkeypatch.setattr("skytether.node.removals.listed", late)
+
+    async def run() -> None:
+        site = Site(engine)
+        assert b"another container is just joining its network" in await site.ask(
+            f"POST /v1.41/containers/{X}/kill?signal=KILL"
+        )
+        await site.soon(f"POST /containers/{X}/unpause")
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("by", ["the kernel", "the engine"])
+def test_who_joined_the_network_of_one_that_ended_meanwhile_is_ended(engine: Engine, tmp_path: Path, by: str) -> None:
+    """The kernel ended it for want of memory, paused as it was: by then its number was another's, of the machine."""
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+    group = tmp_path / "pids" / "docker" / X
+    group.mkdir(parents=True)
+    (tmp_path / "pids" / "cgroup.procs").write_text("")
+    (group / "tasks").write_text("7\n" if by == "the kernel" else "")
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        starts = await site.slowly(f"POST /v1.41/containers/{Y}/start")
+        assert b"another container is just joining its network" in await site.ask(
+            f"POST /v1.41/containers/{X}/start"
+        ), "it would have another number then"
+        if by == "the kernel":
+            (group / "tasks").write_text("")
+        else:
+            engine.running.discard(X)
+        engine.slow.popitem()[1].set()
+        said = await starts
+        assert b"409 Conflict" in said
+        assert b"whose network it joined ended meanwhile" in said
+        assert f"POST /containers/{Y}/kill?signal=KILL" in engine.lines
 
     asyncio.run(run())
 

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
 import secrets
+import signal
+import subprocess
 import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from datetime import datetime
 from http import HTTPStatus
 from pathlib import Path
 
@@ -51,6 +58,51 @@ def test_whose_network_another_one_joins_goes_on_after_that(gated: Gated) -> Non
     assert [state["Status"] for state in states] == ["running", "running"]
     assert gated.ask(f"POST /containers/{holds}/kill?signal=KILL").status == HTTPStatus.NO_CONTENT
     assert gated.ask(f"DELETE /containers/{joins}?force=1").status == HTTPStatus.NO_CONTENT
+
+
+def test_who_joined_the_network_of_a_process_of_the_machine_is_ended_at_once(gated: Gated) -> None:
+    """As the kernel ends who holds the network, paused as it is, for want of memory, and gives its number to another.
+
+    What makes the network is stopped meanwhile: an attacker has an engine wait for a large volume that it removes.
+    """
+    gated.network()
+    holds, _ = gated.make()
+    joins, _ = gated.make(network=f"container:{holds}", starts=False)
+    number = int(json.loads(ask(ENGINE, f"/containers/{holds}/json").content)["State"]["Pid"])
+    with ThreadPoolExecutor() as pool, ExitStack() as after:
+        said = pool.submit(gated.ask, f"POST /containers/{joins}/start")
+        while not (runtime := _runtime_of(joins)):
+            assert not said.done()
+        os.kill(runtime, signal.SIGSTOP)
+        after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
+        os.kill(number, signal.SIGKILL)
+        assert ask(ENGINE, f"/containers/{holds}/unpause", method="POST").status == HTTPStatus.NO_CONTENT
+        while Path(f"/proc/{number}").exists():
+            time.sleep(0.01)
+        while True:
+            Path("/proc/sys/kernel/ns_last_pid").write_text(str(number - 1))
+            other = subprocess.Popen(["sleep", "60"])
+            after.callback(other.wait)
+            after.callback(other.kill)
+            if other.pid == number:
+                break
+        os.kill(runtime, signal.SIGCONT)
+        answer = said.result(30)
+    assert (answer.status, b"ended meanwhile" in answer.content) == (HTTPStatus.CONFLICT, True), answer.content
+    state = json.loads(ask(ENGINE, f"/containers/{joins}/json").content)["State"]
+    assert state["Running"] is False
+    began, ended = (datetime.fromisoformat(state[key][:26] + "+00:00") for key in ("StartedAt", "FinishedAt"))
+    print(f"it was in the network of the machine for {(ended - began).total_seconds():.3f} s")  # noqa: T201
+
+
+def _runtime_of(container: str) -> int | None:
+    """The process that makes a container just now."""
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            words = path.read_bytes().split(b"\0")
+            if b"create" in words and container.encode() in words and b"runc" in words[0]:
+                return int(path.parent.name)
+    return None
 
 
 def test_who_starts_after_a_restart_of_the_node_by_what_was_asked_before_it_has_kin(gated: Gated) -> None:

@@ -13,7 +13,7 @@ import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
-from typing import NamedTuple, TypeVar
+from typing import Self, TypeVar
 
 from .asking import begun, conflict
 from .cgroups import Cgroups
@@ -26,6 +26,9 @@ _WAIT_S = 30.0
 """For those that just join, before one is ended."""
 _TRY_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused, or ended."""
+_LOOK_S = 0.02
+"""Between looks whether the one whose network is joined has ended."""
+_STATE = "Running", "Pid", "StartedAt"
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
@@ -37,28 +40,38 @@ class BusyError(Exception):
     """It is not done now; in a sentence."""
 
 
-class Life(NamedTuple):
-    """Of a container, as long as it is the same."""
+class Life:
+    """Of a container, from now on until it ends: it may be started again after that, and is another one then."""
 
-    has_processes: bool
-    """By the kernel's word, where it can be seen: its first process is the last to go, and keeps its number so long."""
-    told: tuple[object, ...] | None
-    """What the engine says of it; None: nothing."""
+    def __init__(self, engine: str, container: str) -> None:
+        """``engine``: path of its socket. `begin` comes next."""
+        self._engine, self._container = engine, container
+        self._cgroups: Cgroups | None = None
+        self._told: list[object] | None = None
 
-    def goes_on(self, now: Life) -> bool:
-        """Whether it has not ended since."""
-        return self.told is not None and self.told == now.told and now.has_processes >= self.has_processes
+    async def begin(self) -> Self:
+        """Look at it first."""
+        with contextlib.suppress(OSError):
+            cgroups = await asyncio.to_thread(Cgroups)
+            self._cgroups = cgroups if cgroups.go_on(self._container) else None
+        self._told = await self._ask()
+        return self
 
+    def has_ended(self) -> bool:
+        """By the kernel's word, where that can be seen: its first process is its last, and has its number so long."""
+        return self._cgroups is not None and not self._cgroups.go_on(self._container)
 
-async def life(engine: str, container: str) -> Life:
-    """Of a container that is there; ``engine``: path of its socket."""
-    try:
-        has_processes = (await asyncio.to_thread(Cgroups)).go_on(container)
-        answer = await ask_soon(engine, f"/containers/{container}/json")
-        state = picked(answer.content, "State", "Running", "Pid", "StartedAt")["State"]
-        return Life(has_processes, (state["Running"], state.get("Pid"), state.get("StartedAt")))
-    except (OSError, ValueError, LookupError, TypeError):
-        return Life(False, None)
+    async def goes_on(self) -> bool:
+        """Whether it has not ended, as far as is known."""
+        return not self.has_ended() and self._told is not None and self._told == await self._ask()
+
+    async def _ask(self) -> list[object] | None:
+        try:
+            answer = await ask_soon(self._engine, f"/containers/{self._container}/json")
+            state = picked(answer.content, "State", *_STATE)["State"]
+        except (OSError, ValueError, LookupError, TypeError):
+            return None
+        return [state.get(key) for key in _STATE]
 
 
 class Joins:
@@ -100,14 +113,16 @@ class Joins:
                     held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if held.status >= HTTPStatus.BAD_REQUEST:
                         return held  # it has ended, or is about to, or somebody else has it paused
-                    before = await life(self._engine, joined)
-                    try:
-                        started = await ask_long(self._engine, path, method="POST")
-                    finally:
-                        goes_on = before.goes_on(await life(self._engine, joined))
-                        if not goes_on:
-                            await self.end_joined(container)
-                    return started if goes_on else conflict(_ENDED)
+                    life = await Life(self._engine, joined).begin()
+                    starts = begun(ask_long(self._engine, path, method="POST"))
+                    while not starts.done():
+                        await asyncio.wait((starts,), timeout=_LOOK_S)
+                        if life.has_ended():
+                            await self._kill(container)  # the engine does it as soon as it has started it
+                    if not await life.goes_on():
+                        await self.end_joined(container)
+                        return conflict(_ENDED)
+                    return starts.result()
                 finally:
                     if held is None or held.status < HTTPStatus.BAD_REQUEST:
                         await self._go_on(joined)
@@ -123,12 +138,18 @@ class Joins:
         """End one that may be in another network than the one that it was to join."""
         for wait_s in _TRY_S:
             await asyncio.sleep(wait_s)
-            with contextlib.suppress(OSError, ValueError):
-                answer = await ask_long(self._engine, f"/containers/{container}/kill?signal=KILL", method="POST")
-                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR:  # or it does not run
-                    log.warning("container %s was ended: the one whose network it joined ended meanwhile", container)
-                    return
+            if await self._kill(container):
+                log.warning("container %s was ended: the one whose network it joined ended meanwhile", container)
+                return
         log.error("container %s may be in the network of this machine: docker kill %s", container, container)
+
+    async def _kill(self, container: str) -> bool:
+        """Whether it does not run any more."""
+        try:
+            answer = await ask_long(self._engine, f"/containers/{container}/kill?signal=KILL", method="POST")
+        except (OSError, ValueError):
+            return False
+        return answer.status < HTTPStatus.INTERNAL_SERVER_ERROR
 
     async def _go_on(self, container: str) -> None:
         for wait_s in _TRY_S:

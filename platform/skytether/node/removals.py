@@ -24,7 +24,7 @@ from urllib.parse import urlencode
 from .asking import begun, conflict
 from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
-from .joins import BusyError, Joins, life
+from .joins import BusyError, Joins, Life
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
 
@@ -310,14 +310,14 @@ class Removals:
             container: Its id.
             joining: Those that are to be in its network.
         """
-        before = await life(self._engine, container)
+        life = await Life(self._engine, container).begin()
         idle = {one for one in joining if await self._runs(one) is False}  # a start of theirs may be under way
         for one in joining:
             while await self._runs(one) is False and time.monotonic() < self._quiet_from:
                 await asyncio.sleep(_IDLE_S)
             while not await self._is_told_of(one):
                 await asyncio.sleep(_SETTLED_S)
-            if one in idle and await self._runs(one) and not before.goes_on(await life(self._engine, container)):
+            if one in idle and await self._runs(one) and not await life.goes_on():
                 await self._joins.end_joined(one)
 
     async def _look_again(self) -> None:
