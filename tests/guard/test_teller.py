@@ -282,7 +282,7 @@ def test_who_comes_to_one_that_is_silent_meanwhile_hears_a_standstill_first_of_i
 
     It was taken for one that the other one tells, and heard full speed, which went on.
     """
-    first, second = both
+    first, _ = both
     for i in range(3):
         first.turn(1.0 + i * PERIOD, FAST)
     first.wheels.nodes = frozenset()
