@@ -972,6 +972,14 @@ def test_who_joined_the_network_of_one_that_ended_meanwhile_is_ended(engine: Eng
     asyncio.run(run())
 
 
+def test_who_joined_the_network_of_one_that_had_ended_just_before_is_ended(engine: Engine) -> None:
+    """It was paused, and then the kernel ended it before anybody looked."""
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+    said = say(engine, request(f"POST /v1.41/containers/{Y}/start"))
+    assert b"whose network it joined ended meanwhile" in said
+    assert f"POST /containers/{Y}/kill?signal=KILL" in engine.lines
+
+
 def test_what_an_earlier_program_made_to_look_at_an_image_is_removed(engine: Engine) -> None:
     """Whoever had the node's program ended again and again, had these pile up, and nobody else may remove them."""
     look = {"Names": [f"/skytether-look-{'0' * 8}"], "Labels": {"skytether.io/owner": "-"}}

@@ -63,7 +63,8 @@ class Life:
 
     async def goes_on(self) -> bool:
         """Whether it has not ended, as far as is known."""
-        return not self.has_ended() and self._told is not None and self._told == await self._ask()
+        told = await self._ask()  # first: what the kernel says after that is the newer word
+        return told is not None and told[0] is True and told == self._told and not self.has_ended()
 
     async def _ask(self) -> list[object] | None:
         try:
@@ -168,7 +169,7 @@ class Joins:
             joining: Waits for those that joined its network then. The engine may never let it end, if what runs there
                 sees to that.
         """
-        if container in self._pauses:  # it was paused for who joins just now, or has been let go on already
+        if container in self._pauses:  # it is paused for who joins just now, or is about to be let go on
             return
         lock = self._pauses[container] = asyncio.Lock()
         self._joined[container] += 1
