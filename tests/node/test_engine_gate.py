@@ -50,6 +50,7 @@ WITH_VOLUME = (CREATED % f"container:{ID}".encode()).replace(
 
 OWN_VOLUME = {"Name": "a" * 64, "Destination": "/run/skytether"}
 VOLUME = b'{"Name": "skytether-main_state", "Labels": {"skytether.io/owner": "edge"}}'
+X, Y, Z = "a" * 64, "b" * 64, "c" * 64
 
 
 class Engine:
@@ -403,7 +404,7 @@ def test_orchestrators_make_some_networks_and_not_all_that_an_engine_has_room_fo
     [
         {"HostConfig": {"NetworkMode": "lab", "ReadonlyRootfs": True}, "NetworkSettings": {"Networks": {}}},
         {
-            "HostConfig": {"NetworkMode": f"container:{ID}", "ReadonlyRootfs": True},
+            "HostConfig": {"NetworkMode": f"container:{X}", "ReadonlyRootfs": True},
             "NetworkSettings": {"Networks": {"lab": {}}},
         },
     ],
@@ -412,7 +413,7 @@ def test_a_container_starts_in_networks_that_are_open_to_it_still(
     engine: Engine, networks: dict[str, Any], container: dict[str, Any], good: bool, says: bytes
 ) -> None:
     """It is connected by their names: who closed a network by making it anew would find it in there."""
-    engine.networks, engine.container = networks, {**container, "Mounts": []}
+    engine.networks, engine.container, engine.running = networks, {**container, "Mounts": []}, {X}
     got = say(engine, request(f"POST /v1.41/containers/{ID}/start"))
     assert (b"200 OK" in got) is good
     assert says in got
@@ -1043,7 +1044,6 @@ def test_large_bodies_that_never_end_take_no_memory_beyond_some(engine: Engine) 
     assert asyncio.run(run()) == 2
 
 
-X, Y, Z = "a" * 64, "b" * 64, "c" * 64
 OWN = "9" * 64
 """The volume that X alone has."""
 
