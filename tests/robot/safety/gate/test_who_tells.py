@@ -96,6 +96,12 @@ class Stage:
                 if role in self.runs:
                     getattr(self, f"_{role}")()
 
+    def wait(self, seconds):
+        """Nobody runs meanwhile; what they did before does not count."""
+        self.now += seconds
+        self.due = {role: due + seconds for role, due in self.due.items()}
+        self.begins, self.told = self.now, []
+
     def _gate(self):
         if self.now < self.due["gate"]:
             return
@@ -145,6 +151,8 @@ class Stage:
 @pytest.fixture(params=[(0.0, 0.01, 0.005), (0.015, 0.0, 0.018)])
 def stage(tmp_path, request):
     stage = Stage(tmp_path, request.param)
+    stage.run(0.05)
+    stage.wait(8.0)  # who has listened for so long listens to both
     stage.run(0.6)
     assert stage.told[-1][2] == WANTED
     assert stage.finding().violations == ()
@@ -187,6 +195,16 @@ def test_whoever_goes_on_after_a_while_goes_on_from_what_was_told(stage, gone, s
     assert stage.told[-1][2] == WANTED
     assert stage.spoke(back + 3 * PERIOD) == ["writer"]
     assert stage.spoke(since) in (["writer"], ["gate", "writer"], ["writer", "gate", "writer"])
+
+
+def test_whose_writer_is_gone_stands_at_once_where_who_turns_the_wheels_came_just_now(tmp_path):
+    stage = Stage(tmp_path)
+    stage.run(1.0)
+    since = stage.now
+    stage.runs -= {"writer"}
+    stage.run(0.5)
+    assert {velocity for at, who, velocity in stage.told if who == "gate" and at > since} == {STANDSTILL}
+    stage.close()
 
 
 def test_a_writer_that_goes_on_beside_another_guard_tells_the_wheels_nothing(tmp_path):
