@@ -203,8 +203,9 @@ class Teller:
         unheard = self._is_stuck() or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
-        if not self._own.at >= self._strangers_at and now - self._strangers_at < _CONNECTS_S:
-            self._failed(now)  # they know nothing of what was told before, and perhaps the other one did not reach them
+        tells_them = self._own.at >= self._strangers_at and now - self._own.at <= self._watch.patience_s
+        if not tells_them and now - self._strangers_at < _CONNECTS_S:
+            self._failed(now)  # perhaps the other one did not reach them: they know nothing, or have stopped
         if not stopped and self._waits(now):
             return False
         self.unread = self._wheels.unread()
