@@ -64,7 +64,12 @@ class Life:
     async def goes_on(self) -> bool:
         """Whether it has not ended, as far as is known."""
         told = await self._ask()  # first: what the kernel says after that is the newer word
-        return told is not None and told[0] is True and told == self._told and not self.has_ended()
+        same = told == self._told or (told is None and self._cgroups is not None)
+        return self.is_known() and same and not self.has_ended()
+
+    def is_known(self) -> bool:
+        """Whether it was there at first."""
+        return self._told is not None and self._told[0] is True
 
     async def _ask(self) -> list[object] | None:
         try:
@@ -115,6 +120,8 @@ class Joins:
                     if held.status >= HTTPStatus.BAD_REQUEST:
                         return held  # it has ended, or is about to, or somebody else has it paused
                     life = await Life(self._engine, joined).begin()
+                    if not life.is_known():
+                        raise BusyError("its engine says nothing of the container whose network it joins")
                     starts = begun(ask_long(self._engine, path, method="POST"))
                     while not starts.done():
                         await asyncio.wait((starts,), timeout=_LOOK_S)

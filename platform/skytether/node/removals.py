@@ -294,6 +294,12 @@ class Removals:
                 paused = time.monotonic() > asked_until or await self._is_paused(container)
             if paused:
                 await self._joins.let_go_on(container, partial(self._until_joined, container, joins))
+            elif joins and self._old is None:  # it may have ended as they joined it
+                begun(self._until_joined(container, joins))
+
+    async def _is_said_to_run(self, container: str) -> bool:
+        """Of one that an engine starts it says nothing."""
+        return await self._is_told_of(container) and bool(await self._runs(container))
 
     async def _is_paused(self, container: str) -> bool:
         """Whether it is, or may be."""
@@ -311,7 +317,7 @@ class Removals:
             joining: Those that are to be in its network.
         """
         life = await Life(self._engine, container).begin()
-        idle = {one for one in joining if await self._runs(one) is False}  # a start of theirs may be under way
+        idle = {one for one in joining if not await self._is_said_to_run(one)}  # a start of theirs may be under way
         for one in joining:
             while await self._runs(one) is False and time.monotonic() < self._quiet_from:
                 await asyncio.sleep(_IDLE_S)
