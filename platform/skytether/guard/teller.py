@@ -14,6 +14,8 @@ the other one has either seen that or cannot speak any more:
   known to have left, or never: after that they stand.
 - Where the kernel keeps what was sent until it is acknowledged, and sends it again, a first that stood still with
   something of that is ended by the second that has taken over (`board.Place.keep`).
+- Each has its own connections, and the board does not say whom a word reached: whoever came lately to one who takes
+  over, or goes on after it stood still, hears a standstill of that one first.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Mapping
 from http import HTTPStatus
 from typing import Any, TypeVar
 
-from .machine import Answer, ask_soon, lean
+from .machine import Answer, ask_soon, lean, picked
 
 _T = TypeVar("_T")
+_STATE = "Running", "Paused", "Pid", "StartedAt"
 JSON, TAR = "Content-Type: application/json", "Content-Type: application/x-tar"
 _GOING: set[asyncio.Task[Any]] = set()
 """A loop itself keeps no task that waits: it would be thrown away, if nobody else knows it."""
@@ -48,6 +49,21 @@ class Asking:
             return answer.status, lean(answer.content)
         except ValueError as error:
             raise RefusedCall(f"its engine does not answer: {error}", HTTPStatus.SERVICE_UNAVAILABLE) from error
+
+
+async def state_of(engine: str, container: str, **how: Any) -> Mapping[str, Any] | None:
+    """What an engine says of the state of a container; None: nothing, or it has no such one.
+
+    Args:
+        engine: Path of its socket.
+        container: Its id.
+        how: As `ask_soon`.
+    """
+    try:
+        answer = await ask_soon(engine, f"/containers/{container}/json", **how)
+        return dict(picked(answer.content, "State", *_STATE)["State"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
 
 
 def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:

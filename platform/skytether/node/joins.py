@@ -15,9 +15,9 @@ from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Self, TypeVar
 
-from .asking import begun, conflict
+from .asking import begun, conflict, state_of
 from .cgroups import Cgroups
-from .machine import Answer, ask_long, ask_soon, picked
+from .machine import Answer, ask_long
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,6 @@ _TRY_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused, or ended."""
 _LOOK_S = 0.02
 """Between looks whether the one whose network is joined has ended."""
-_STATE = "Running", "Pid", "StartedAt"
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
@@ -72,12 +71,8 @@ class Life:
         return self._told is not None and self._told[0] is True
 
     async def _ask(self) -> list[object] | None:
-        try:
-            answer = await ask_soon(self._engine, f"/containers/{self._container}/json")
-            state = picked(answer.content, "State", *_STATE)["State"]
-        except (OSError, ValueError, LookupError, TypeError):
-            return None
-        return [state.get(key) for key in _STATE]
+        state = await state_of(self._engine, self._container)
+        return None if state is None else [state.get(key) for key in ("Running", "Pid", "StartedAt")]
 
 
 class Joins:

@@ -21,7 +21,7 @@ from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
-from .asking import begun, conflict
+from .asking import begun, conflict, state_of
 from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
 from .joins import BusyError, Joins, Life
@@ -299,15 +299,13 @@ class Removals:
 
     async def _is_said_to_run(self, container: str) -> bool:
         """Of one that an engine starts it says nothing."""
-        return await self._is_told_of(container) and bool(await self._runs(container))
+        state = await state_of(self._engine, container, patience=_SETTLED_S)
+        return state is not None and state.get("Running") is not False
 
     async def _is_paused(self, container: str) -> bool:
         """Whether it is, or may be."""
-        try:
-            answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
-            return picked(answer.content, "State", "Paused")["State"]["Paused"] is not False
-        except (OSError, ValueError, LookupError, TypeError):
-            return True
+        state = await state_of(self._engine, container, patience=_SETTLED_S)
+        return state is None or state.get("Paused") is not False
 
     async def _until_joined(self, container: str, joining: Iterable[str]) -> None:
         """Wait until a container's network is not being joined any more; who joined another's by that is ended.
