@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 from gated_engine import ENGINE, Gated, gate_at, gated
 
+from skytether.node import shims
 from skytether.node.machine import ask
 
 __all__ = ["gated"]
@@ -60,15 +61,26 @@ def test_whose_network_another_one_joins_goes_on_after_that(gated: Gated) -> Non
     assert gated.ask(f"DELETE /containers/{joins}?force=1").status == HTTPStatus.NO_CONTENT
 
 
-def test_who_joined_the_network_of_a_process_of_the_machine_is_ended_at_once(gated: Gated) -> None:
+@pytest.mark.parametrize("held", [True, False])
+def test_who_joins_the_network_of_one_that_ends_meanwhile_is_in_no_other(
+    gated: Gated, held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As the kernel ends who holds the network, paused as it is, for want of memory, and gives its number to another.
 
     What makes the network is stopped meanwhile: an attacker has an engine wait for a large volume that it removes.
+
+    Args:
+        gated: The engine.
+        held: Whether that number can be kept; if not, who joined is ended at once.
+        monkeypatch: Has it not be kept.
     """
+    if not held:
+        monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: False)
     gated.network()
     holds, _ = gated.make()
     joins, _ = gated.make(network=f"container:{holds}", starts=False)
     number = int(json.loads(ask(ENGINE, f"/containers/{holds}/json").content)["State"]["Pid"])
+    stat = Path(f"/proc/{number}/stat")
     with ThreadPoolExecutor() as pool, ExitStack() as after:
         said = pool.submit(gated.ask, f"POST /containers/{joins}/start")
         while not (runtime := _runtime_of(joins)):
@@ -76,23 +88,42 @@ def test_who_joined_the_network_of_a_process_of_the_machine_is_ended_at_once(gat
         os.kill(runtime, signal.SIGSTOP)
         after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
         os.kill(number, signal.SIGKILL)
-        assert ask(ENGINE, f"/containers/{holds}/unpause", method="POST").status == HTTPStatus.NO_CONTENT
-        while Path(f"/proc/{number}").exists():
+        for freezer in Path("/sys/fs/cgroup").glob(f"freezer/**/*{holds}*/freezer.state"):
+            freezer.write_text("THAWED")
+        while " Z " not in stat.read_text() if held else stat.exists():
             time.sleep(0.01)
-        while True:
+        for _ in range(20 if held else 10_000):
             Path("/proc/sys/kernel/ns_last_pid").write_text(str(number - 1))
             other = subprocess.Popen(["sleep", "60"])
             after.callback(other.wait)
             after.callback(other.kill)
             if other.pid == number:
                 break
+        assert (other.pid == number) is not held
         os.kill(runtime, signal.SIGCONT)
         answer = said.result(30)
     assert (answer.status, b"ended meanwhile" in answer.content) == (HTTPStatus.CONFLICT, True), answer.content
+    assert not stat.exists(), "its end is heard, late"
     state = json.loads(ask(ENGINE, f"/containers/{joins}/json").content)["State"]
     assert state["Running"] is False
-    began, ended = (datetime.fromisoformat(state[key][:26] + "+00:00") for key in ("StartedAt", "FinishedAt"))
-    print(f"it was in the network of the machine for {(ended - began).total_seconds():.3f} s")  # noqa: T201
+    assert state["StartedAt"].startswith("0001-") is held, "it never ran"
+    if not held:
+        began, ended = (datetime.fromisoformat(state[key][:26] + "+00:00") for key in ("StartedAt", "FinishedAt"))
+        print(f"it was in the network of the machine for {(ended - began).total_seconds():.3f} s")  # noqa: T201
+
+
+def test_what_an_earlier_program_stopped_goes_on(gated: Gated) -> None:
+    """It was killed while a container joined another's network: nobody could end that one any more."""
+    gated.network()
+    holds, _ = gated.make()
+    gated.make(network=f"container:{holds}")
+    number = int(json.loads(ask(ENGINE, f"/containers/{holds}/json").content)["State"]["Pid"])
+    assert ask(ENGINE, f"/containers/{holds}/pause", method="POST").status == HTTPStatus.NO_CONTENT
+    assert shims.stop(holds, number)
+    with tempfile.TemporaryDirectory(prefix="sky-") as folder, gate_at(str(Path(folder) / "gate.sock")):
+        again = Gated(str(Path(folder) / "gate.sock"), gated.name)
+        assert again.ask(f"POST /containers/{holds}/kill?signal=KILL").status == HTTPStatus.NO_CONTENT
+        assert again.ask(f"POST /containers/{holds}/wait").status == HTTPStatus.OK
 
 
 def _runtime_of(container: str) -> int | None:

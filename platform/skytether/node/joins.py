@@ -2,7 +2,8 @@
 
 An engine names that network by the number of a process. If that ended before runc looks, another process could have its
 number: one of the machine, whose network the container would be in. Where the memory of the machine is used up, the
-kernel ends what is paused, too: then who joined is ended at once.
+kernel ends what is paused, too: so nobody else gets that number meanwhile (`shims`). Where that cannot be seen to, who
+joined is ended at once.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Self, TypeVar
 
+from . import shims
 from .asking import begun, conflict, state_of
 from .cgroups import Cgroups
 from .machine import Answer, ask_long
@@ -70,6 +72,10 @@ class Life:
         """Whether it was there at first."""
         return self._told is not None and self._told[0] is True
 
+    def first(self) -> object:
+        """The number of its first process, as the engine says it."""
+        return self._told[1] if self._told else None
+
     async def _ask(self) -> list[object] | None:
         state = await state_of(self._engine, self._container)
         return None if state is None else [state.get(key) for key in ("Running", "Pid", "StartedAt")]
@@ -87,6 +93,8 @@ class Joins:
         """They do one at a time."""
         self._ending: Counter[str] = Counter()
         """Of calls by which a container may end."""
+        self._noted = False
+        """Whether it was told that numbers cannot be held."""
 
     def may_join(self, joined: str, *, new: bool) -> None:
         """Raises `BusyError` where no container joins the network of that one now; ``new``: nor is it about to."""
@@ -117,6 +125,9 @@ class Joins:
                     life = await Life(self._engine, joined).begin()
                     if not life.is_known():
                         raise BusyError("its engine says nothing of the container whose network it joins")
+                    self._note(await asyncio.to_thread(shims.stop, joined, life.first()))
+                    if life.has_ended():
+                        raise BusyError("the container whose network it joins has ended")
                     starts = begun(ask_long(self._engine, path, method="POST"))
                     while not starts.done():
                         await asyncio.wait((starts,), timeout=_LOOK_S)
@@ -154,7 +165,16 @@ class Joins:
             return False
         return answer.status < HTTPStatus.INTERNAL_SERVER_ERROR
 
+    def _note(self, stopped: bool) -> None:
+        if not stopped and not self._noted:
+            self._noted = True
+            log.warning(
+                "its engine's processes beside containers cannot be stopped (another user's, or hidden from this one): "
+                "who joins a network whose container ends in that moment may be in this machine's until it is ended"
+            )
+
     async def _go_on(self, container: str) -> None:
+        await asyncio.to_thread(shims.let_go_on, container)  # nobody ends a container, or has it go on, without it
         for wait_s in _TRY_S:
             await asyncio.sleep(wait_s)
             with contextlib.suppress(OSError, ValueError):

@@ -1,0 +1,92 @@
+"""The process beside a container is stopped, and goes on; nobody else's is."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from skytether.node import shims
+
+ONE, OTHER = "1" * 64, "2" * 64
+FIRST = 4
+
+
+@pytest.fixture
+def beside(request):
+    """One that is called as containerd's is, or as told."""
+    name = getattr(request, "param", "containerd-shim-runc-v2")
+    words = [name, "-c", "import time; time.sleep(60)", "-namespace", "moby", "-id", ONE]
+    process = subprocess.Popen(words, executable=sys.executable)
+    while name not in Path(f"/proc/{process.pid}/cmdline").read_text():
+        time.sleep(0.001)
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.fixture
+def proc(tmp_path, beside):
+    """What the kernel shows of it, and of a container's first process."""
+    (tmp_path / str(beside.pid)).symlink_to(f"/proc/{beside.pid}")
+    (tmp_path / str(FIRST)).mkdir()
+    (tmp_path / "self").mkdir()
+    first(tmp_path, beside.pid)
+    return tmp_path
+
+
+def first(proc, parent, *, state="S", container=ONE):
+    (proc / str(FIRST) / "stat").write_text(f"{FIRST} (a (odd) Z 1) {state} {parent} 4 4 0\n")
+    (proc / str(FIRST) / "cgroup").write_text(f"0::/docker/{container}\n")
+
+
+def state_of(process):
+    return Path(f"/proc/{process.pid}/stat").read_text().split(")")[1].split()[0]
+
+
+def test_it_stops_and_goes_on(proc, beside):
+    assert shims.stop(ONE, FIRST, proc)
+    assert state_of(beside) == "T"
+    shims.let_go_on(OTHER, proc)
+    assert state_of(beside) == "T"
+    shims.let_go_on(ONE, proc)
+    assert state_of(beside) != "T"
+    shims.let_go_on(ONE, proc)
+
+
+@pytest.mark.parametrize("beside", ["sshd", "python3"], indirect=True)
+def test_nothing_else_is_stopped(proc, beside):
+    assert not shims.stop(ONE, FIRST, proc)
+    assert state_of(beside) != "T"
+
+
+def test_that_of_another_container_is_not_stopped(proc, beside):
+    assert not shims.stop(OTHER, FIRST, proc)
+    assert state_of(beside) != "T"
+
+
+@pytest.mark.parametrize("how", [{"state": "Z"}, {"state": "X"}, {"container": OTHER}])
+def test_the_number_of_one_that_ended_is_not_its_own(proc, beside, how):
+    first(proc, beside.pid, **how)
+    assert not shims.stop(ONE, FIRST, proc)
+    shims.let_go_on(ONE, proc)
+    assert state_of(beside) != "T"
+
+
+def test_one_whose_parent_is_another_one_by_now_has_ended(proc, monkeypatch):
+    send = signal.pidfd_send_signal
+    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *words: (send(*words), first(proc, 1)))
+    assert not shims.stop(ONE, FIRST, proc)
+
+
+@pytest.mark.parametrize("number", [None, 0, FIRST + 1, "4/../.."])
+def test_a_number_that_is_nobodys_is_not_its_own(proc, number):
+    assert not shims.stop(ONE, number, proc)
+
+
+def test_what_does_not_stop_holds_nothing(proc, monkeypatch):
+    monkeypatch.setattr(shims, "_STOPS_S", 0.0)
+    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *_: None)
+    assert not shims.stop(ONE, FIRST, proc)
