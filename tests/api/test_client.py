@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -33,6 +34,8 @@ class Script:
     def __init__(self) -> None:
         self.answers: dict[tuple[str, str], Answer] = {}
         self.asked: list[tuple[str, str, dict[str, str], Any]] = []
+        self.late: dict[tuple[str, str], float] = {}
+        """How long some answers take [s]."""
         self.url = ""
 
     def says(self, method: str, path: str, document: Any, status: int = 200) -> None:
@@ -48,6 +51,7 @@ def script() -> Iterator[Script]:
             body = self.rfile.read(int(self.headers.get("content-length", 0)))
             headers = {k.lower(): v for k, v in self.headers.items()}
             script.asked.append((self.command, self.path, headers, json.loads(body) if body else None))
+            time.sleep(script.late.get((self.command, self.path), 0))
             status, kind, content = script.answers[self.command, self.path]
             self.send_response(status)
             self.send_header("Content-Type", kind)
@@ -109,6 +113,17 @@ def test_small_verbs(script: Script, client: Client) -> None:
     script.answers["GET", "/api/v1/instances/i1/logs?tail=7&follow=true"] = (200, "text/plain", b"as it comes\n")
     script.says("GET", "/api/v1/instances/i1", INSTANCE)
     assert "".join(client.follow_logs("i1", tail=7)) == "as it comes\n"
+
+
+def test_a_site_is_forgotten_for_as_long_as_its_machine_takes(script: Script) -> None:
+    """An emulated one took longer than any other answer may: `terraform destroy` failed for "no orchestrator"."""
+    script.answers["DELETE", "/api/v1/sites/lab?drain=true"] = (204, "text/plain", b"")
+    script.says("GET", "/api/v1/instances", [])
+    script.late = dict.fromkeys(script.answers, 0.4)
+    with Client(script.url, timeout=0.05) as client:
+        assert client.delete_site("lab", drain=True)
+        with pytest.raises(Unreachable):
+            client.instances()
 
 
 def test_a_problem_is_an_error_with_its_sentence(script: Script, client: Client) -> None:

@@ -219,7 +219,9 @@ def drive(stack: ExitStack, steps: Steps, wheel: str) -> None:
     if re.search(r"sky-[A-Za-z0-9_-]{20,}\.", shown):
         sys.exit("error: a join token is in Terraform's state or output")
     steps.done("terraform apply: from no machine to a site")
-    by_machine(steps, joined, inside)
+    known_hosts = f"UserKnownHostsFile={WORK / 'known_hosts'}"
+    machine = (*inside, "ssh", "-i", str(WORK / "key"), "-o", known_hosts, "-o", "BatchMode=yes", "debian@10.86.9.2")
+    by_machine(steps, joined, run(*machine, "cat", "/var/log/skytether-setup.log"))
     walker = subprocess.Popen(
         ["ip", "netns", "exec", robot, sys.executable, str(HERE / "walker.py"), URL, token, "300"],
         stdin=subprocess.PIPE,
@@ -237,6 +239,9 @@ def drive(stack: ExitStack, steps: Steps, wheel: str) -> None:
     steps.add("**from no machine to the first velocity command**", time.monotonic() - began)
     time.sleep(DRIVEN_S)
     steps.done(f"it is driven, by the site {', '.join(sites_that_run())}")
+    said = run(*machine, "sudo", "journalctl", "--unit", "skytether-node", "--output", "cat", "--no-pager")
+    if "linked" not in said or "cannot be stopped" in said:  # by its unit it may hold the numbers of processes
+        sys.exit(f"error: the node says:\n{said}")
     options = ("--option", "bind_host=10.86.9.1", "--option", "advertise_host=10.86.9.1")
     skytether("site", "add", "house", "--runtime", "process", *options)
     (WORK / "destroy.log").write_text(terraform("destroy", "-auto-approve", *chosen))
@@ -254,10 +259,8 @@ def drive(stack: ExitStack, steps: Steps, wheel: str) -> None:
     )
 
 
-def by_machine(steps: Steps, joined: float, inside: tuple[str, ...]) -> None:
+def by_machine(steps: Steps, joined: float, log: str) -> None:
     """The machine's own account of its set-up: seconds since it was switched on."""
-    ssh = ("ssh", "-i", str(WORK / "key"), "-o", f"UserKnownHostsFile={WORK / 'known_hosts'}", "-o", "BatchMode=yes")
-    log = run(*inside, *ssh, "debian@10.86.9.2", "cat", "/var/log/skytether-setup.log")
     stamps = [(name, float(at)) for at, name in re.findall(r"skytether-setup: ([\d.]+) s: (.*)", log)]
     last = ("boot, until cloud-init sets up", 0.0)
     for name, at in stamps:

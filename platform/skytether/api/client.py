@@ -52,6 +52,8 @@ __all__ = ["ApiError", "Client", "NotRunning", "Unreachable", "addresses"]
 
 _PING_LIMIT = 45.0
 """Seconds without a sign of life after which an event stream counts as dead; the server pings every 15."""
+_EMPTY_S = 120.0
+"""Seconds for a site's engine to remove what ended instances left there: a slow machine takes its time."""
 _RESUME_S = 30.0
 """How long an event stream that was lost is tried again [s]: an orchestrator is restarted in less."""
 _RESUME_PAUSE_S = 0.2
@@ -296,7 +298,8 @@ class Client(Connection):
             Whether it is gone by now.
         """
         query = "?force=true" if force else "?drain=true" if drain else ""
-        return self._request("DELETE", _at("sites", name) + query).status_code != HTTPStatus.ACCEPTED
+        answer = self._request("DELETE", _at("sites", name) + query, patience=_EMPTY_S)
+        return answer.status_code != HTTPStatus.ACCEPTED
 
     def probe(self, site: str) -> float:
         """One round trip to where a site answers, in seconds; the first one also opens the connection."""

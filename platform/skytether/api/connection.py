@@ -94,7 +94,7 @@ class Connection:
                 "(the orchestrator's tls.certificate, or a proxy before it); inside a network that is all yours, such "
                 "as a VPN, allow it with SKYTETHER_INSECURE_HTTP=true, or insecure_http: true in robot.yaml"
             )
-        self._whole = {WHOLE: _STEPS * timeout}
+        self._timeout = timeout
         # Without TLS there is nothing to verify, and loading the authorities' certificates takes 20 ms.
         verify = None if all(url.startswith("http://") for url in self._urls) else _trust(ca_file)
         self._http = httpx.Client(
@@ -138,12 +138,20 @@ class Connection:
             raise ApiError(strange(str(error))) from error
 
     def _request(
-        self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None, prefix: str = _PREFIX
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        headers: dict[str, str] | None = None,
+        prefix: str = _PREFIX,
+        *,
+        patience: float | None = None,
     ) -> httpx.Response:
+        """Ask, and wait for the answer so many seconds; None: as long as for any."""
         document = body.model_dump(mode="json", by_alias=True) if isinstance(body, BaseModel) else body
         again = method != "POST" or "Idempotency-Key" in (headers or {}) or path.endswith(_REPEATABLE)
         try:
-            response = self._send(method, prefix + path, again=again, json=document, headers=headers)
+            response = self._send(method, prefix + path, again=again, patience=patience, json=document, headers=headers)
         except (httpx.TransportError, httpx.InvalidURL) as error:
             raise self.unreachable(error) from error
         if not response.is_success:
@@ -151,7 +159,14 @@ class Connection:
         return response
 
     def _send(
-        self, method: str, path: str, *, again: bool = True, stream: bool = False, **request: Any
+        self,
+        method: str,
+        path: str,
+        *,
+        again: bool = True,
+        stream: bool = False,
+        patience: float | None = None,
+        **request: Any,
     ) -> httpx.Response:
         """Ask the one that answered last; if it is away, each of the others, and that one once more.
 
@@ -160,18 +175,21 @@ class Connection:
             path: Below the address.
             again: Whether it does no harm if two get it.
             stream: Whether the answer's body is left to be read.
+            patience: For the answer, in seconds; None: as for any.
             request: All else, for httpx.
 
         Raises:
             httpx.TransportError: Nobody answers; the last one's.
         """
+        if patience is not None:
+            request["timeout"] = httpx.Timeout(self._http.timeout.connect, read=patience)
         first, count = self._at, len(self._urls)
         alone = count == 1
         for turn in range(count + 1):
             at, last = (first + turn) % count, turn == count
             try:
                 asked = self._http.build_request(method, self._urls[at] + path, **request)
-                asked.extensions |= {} if stream else self._whole
+                asked.extensions |= {} if stream else {WHOLE: _STEPS * (patience or self._timeout)}
                 response = self._http.send(asked, stream=stream)
             except (httpx.ConnectError, httpx.ConnectTimeout):
                 if last or alone:
