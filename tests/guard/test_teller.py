@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from skytether.guard import board
-from skytether.guard.board import Board, Entry, Role
+from skytether.guard.board import Board, Entry, Role, mark
 from skytether.guard.kinematics import Bounds
 from skytether.guard.protocol import Beat, LastCommand
 from skytether.guard.teller import FRESH, Sent, Teller
@@ -31,7 +31,7 @@ class Wheels:
     def __init__(self):
         self.told = []
         self.untils = []
-        self.nodes = frozenset({"/base"})
+        self.nodes = self.names = frozenset({"/base"})
         self.fails: Exception | None = None
         self.room = True
         self.held = None
@@ -57,6 +57,9 @@ class Wheels:
     def listeners(self):
         return self.nodes
 
+    def hearers(self):
+        return self.names
+
 
 class One:
     """One who tells the wheels, with a clock that may jump in the middle of a turn."""
@@ -80,7 +83,8 @@ class One:
 def both():
     file = board.make()
     with closing(board.Board(file)) as page:
-        page.put(Role.FIRST, Entry(LastCommand(FAST, 0.98), left_at=0.98))  # by who had the role before
+        heard = frozenset({mark("/base")})
+        page.put(Role.FIRST, Entry(LastCommand(FAST, 0.98), left_at=0.98, hearers=heard))  # by who had the role before
     first, second = One(file, Role.FIRST), One(file, Role.SECOND)
     yield first, second
     for one in (first, second):
@@ -292,6 +296,53 @@ def test_who_came_just_now_may_have_stopped_while_the_other_one_told_others(both
     while len(first.wheels.told) == before:
         first.turn(turn := turn + PERIOD, FAST)
     assert (first.wheels.told[-1] == STANDSTILL) == soon
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_whom_the_other_one_did_not_reach_hears_a_standstill_first(both, reached):
+    """Their connection to the gate had been reset; it braked for a recorder while the writer stood still for 0.16 s."""
+    first, second = both
+    first.wheels.nodes = first.wheels.names = frozenset({"/base", "/recorder"})
+    second.wheels.nodes = second.wheels.names = first.wheels.names if reached else frozenset({"/recorder"})
+    for one in (first, second):
+        one.turn(-9.0)
+    for i in range(20):
+        first.turn(1.0 + i * PERIOD, FAST)
+    for i in range(1, 9):
+        second.turn(1.385 + i * PERIOD)
+    assert second.wheels.told[-1].linear > 0
+    turn, before = 1.38 + 8 * PERIOD, len(first.wheels.told)
+    while len(first.wheels.told) == before:
+        first.turn(turn := turn + PERIOD, FAST)
+    assert (first.wheels.told[-1] == STANDSTILL) is not reached
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_whom_the_first_did_not_reach_hears_a_standstill_first_of_the_second(both, reached):
+    first, second = both
+    second.wheels.nodes = second.wheels.names = frozenset({"/base", "/recorder"})
+    first.wheels.nodes = first.wheels.names = second.wheels.names if reached else frozenset({"/recorder"})
+    for one in (first, second):
+        one.turn(-9.0)
+    for i in range(20):
+        first.turn(1.0 + i * PERIOD, FAST)
+    before = len(second.wheels.told)
+    for i in range(1, 5):
+        second.turn(1.385 + i * PERIOD)
+    assert (second.wheels.told[before] == STANDSTILL) is not reached
+
+
+def test_who_came_after_the_last_word_did_not_hear_it(both):
+    """The gate claims, which it writes down, too, once it has somebody who listens."""
+    first, second = both
+    for i in range(20):
+        first.turn(1.0 + i * PERIOD, FAST)
+    known = first.board.of(Role.FIRST).hearers
+    first.wheels.names = frozenset({"/base", "/late"})
+    first.board.put(Role.SECOND, Entry(claim=1.39))
+    assert not first.turn(1.42)
+    assert first.board.of(Role.FIRST).claim == 1.42
+    assert first.board.of(Role.FIRST).hearers == known
 
 
 def test_who_comes_to_one_that_is_silent_meanwhile_hears_a_standstill_first_of_it(both):
@@ -507,7 +558,7 @@ def test_the_next_one_in_a_role_goes_on_with_the_entry_of_the_one_before():
     for i in range(5):
         before.turn(1.0 + i * PERIOD)
     after = One(file, Role.SECOND)
-    assert after.board.of(Role.SECOND) == (LastCommand(STANDSTILL, 1.08), 1.0, 1.08)
+    assert after.board.of(Role.SECOND) == (LastCommand(STANDSTILL, 1.08), 1.0, 1.08, {mark("/base")})
     after.board.put(Role.FIRST, Entry(LastCommand(FAST, 1.1), left_at=1.1))
     assert not after.turn(1.12)
     assert isnan(after.board.of(Role.SECOND).claim)  # what a dead one has claimed is given back by the next
@@ -529,6 +580,15 @@ def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
     assert Board(file).newest().told == LastCommand(FAST, 5.0)  # as another process sees it
     with pytest.raises(PermissionError):
         os.ftruncate(file, 0)
+    os.close(file)
+
+
+def test_of_very_many_who_listen_some_are_written_down():
+    file = board.make()
+    page, many = Board(file), frozenset(map(mark, map(str, range(40))))
+    page.put(Role.FIRST, Entry(LastCommand(FAST, 1.0), 1.0, 1.0, many))
+    assert page.of(Role.FIRST).hearers < many
+    assert len(page.of(Role.FIRST).hearers) == 16
     os.close(file)
 
 

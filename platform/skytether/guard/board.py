@@ -14,6 +14,7 @@ import signal
 import struct
 import time
 from enum import IntEnum
+from hashlib import blake2b
 from math import inf, isfinite, isnan, nan
 from typing import NamedTuple
 from zlib import crc32
@@ -22,10 +23,11 @@ from .kernel_buffers import is_anything_unacknowledged
 from .protocol import LastCommand
 from .velocity import Velocity
 
-_ENTRY = struct.Struct("<Qddddd")
+_MOST_HEARERS = 16
+_ENTRY = struct.Struct(f"<Qddddd{_MOST_HEARERS}Q")
 _SUM = struct.Struct("<I")
-_SLOT = 64
-"""Bytes between two entries: a line of the processor's cache each."""
+_SLOT = 256
+"""Bytes between two entries: no two in one line of the processor's cache."""
 _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")
 """``struct flock`` of the kernel."""
@@ -60,11 +62,18 @@ class Entry(NamedTuple):
 
     The wheels have heard something after that, or nothing since.
     """
+    hearers: frozenset[int] = frozenset()
+    """Who listened as the last was told, by `mark`; of very many only some."""
 
     @property
     def sign(self) -> float:
         """When it last gave a sign of life [s]; NaN: never."""
         return self.claim if not self.told.at >= self.claim and isfinite(self.claim) else self.told.at
+
+
+def mark(name: str) -> int:
+    """What somebody who listens is known by on the board."""
+    return int.from_bytes(blake2b(name.encode(), digest_size=8).digest()) or 1
 
 
 class Place(NamedTuple):
@@ -141,7 +150,9 @@ class Board:
         """Write down. Only one process at a time may have a role."""
         (first, _), (second, _) = self._at(role, 0), self._at(role, 1)
         place, count = (1, first) if first > second else (0, second)
-        data = _ENTRY.pack(count + 1, *entry.told.velocity, entry.told.at, entry.claim, entry.left_at)
+        hearers = sorted(entry.hearers)[:_MOST_HEARERS]
+        hearers += [0] * (_MOST_HEARERS - len(hearers))
+        data = _ENTRY.pack(count + 1, *entry.told.velocity, entry.told.at, entry.claim, entry.left_at, *hearers)
         start = _SLOT * (2 * role + place)
         self._page[start : start + _ENTRY.size + _SUM.size] = data + _SUM.pack(crc32(data))
 
@@ -168,8 +179,9 @@ class Board:
         data = self._page[start : start + _ENTRY.size + _SUM.size]
         if _SUM.unpack_from(data, _ENTRY.size)[0] != crc32(data[: _ENTRY.size]):
             return 0, Entry()
-        count, linear, angular, at, claim, left_at = _ENTRY.unpack_from(data)
-        return count, Entry(LastCommand(Velocity(linear, angular), at), claim, left_at)
+        count, linear, angular, at, claim, left_at, *hearers = _ENTRY.unpack_from(data)
+        told = LastCommand(Velocity(linear, angular), at)
+        return count, Entry(told, claim, left_at, frozenset(hearers) - {0})
 
 
 def make() -> int:

@@ -14,8 +14,8 @@ the other one has either seen that or cannot speak any more:
   known to have left, or never: after that they stand.
 - Where the kernel keeps what was sent until it is acknowledged, and sends it again, a first that stood still with
   something of that is ended by the second that has taken over (`board.Place.keep`).
-- Each has its own connections, and the board does not say whom a word reached: whoever came lately to one who takes
-  over, or goes on after it stood still, hears a standstill of that one first.
+- Each has its own connections. Where somebody listens to one who takes over, or goes on after it stood still, whom the
+  other one's words did not reach, or who came lately, all hear a standstill of that one first.
 - Where velocities go by other threads or processes, one that stands still between its last look at the clock and the
   kernel is ended by who takes over (`board.Place.end_speaker`).
 
@@ -36,7 +36,7 @@ from collections.abc import Callable
 from math import inf, isnan, nan
 from typing import NamedTuple, Protocol
 
-from .board import Board, Entry, Role, end
+from .board import Board, Entry, Role, end, mark
 from .protocol import LastCommand
 from .velocity import STANDSTILL, Velocity
 from .watch import Watch
@@ -119,6 +119,10 @@ class Wheels(Protocol):
         """Who listens to the velocities now, each under a name that is another after it was away; None: not known."""
         ...
 
+    def hearers(self) -> frozenset[str]:
+        """Who listened at the last look, each under a name that both who tell the wheels know it by."""
+        ...
+
     def sent(self) -> Sent | None:
         """How far what was written has come; None: what was written has left."""
         ...
@@ -148,6 +152,8 @@ class Teller:
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers_at = -inf
         """When others came in the place of all who had listened, or the first ones did [s]."""
+        self._names, self._hearers = frozenset[str](), frozenset[int]()
+        """Who listens, and as the board knows them."""
         self._sent: Sent | None = None
         self._written: deque[LastCommand] = deque(maxlen=_WRITTEN)
         """The newest last."""
@@ -161,7 +167,7 @@ class Teller:
         self._kept_s = min(max(_KEPT_S, usual_s), _MOST_KEPT_S)
         self._broken_at = nan
         self._full_at = nan
-        self._own, self._claim, self._left_at = board.of(role)  # of who had the role before
+        self._own, self._claim, self._left_at, self._reached = board.of(role)  # of who had the role before
         self._heard_at = board.newest().left_at
         """As `board.Entry.left_at`, of whoever told the wheels something last."""
 
@@ -184,6 +190,8 @@ class Teller:
         known, self._listeners = self._listeners, self._wheels.listeners()
         if self._listeners and not (known and known & self._listeners):
             self._strangers_at = now
+        if (names := self._wheels.hearers()) != self._names:
+            self._names, self._hearers = names, frozenset(map(mark, names))
 
     def write_velocity(self, now: float, stopped: bool = False) -> bool:
         """Tell the wheels once what the watch has for them. `refresh` comes before.
@@ -206,7 +214,7 @@ class Teller:
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
         tells_them = self._own.at >= self._strangers_at and now - self._own.at <= self._watch.patience_s
-        if not tells_them and now - self._strangers_at < _CONNECTS_S:
+        if not tells_them and (now - self._strangers_at < _CONNECTS_S or self._misses_some()):
             self._failed(now)  # perhaps the other one did not reach them: they know nothing, or have stopped
         if not stopped and self._waits(now):
             return False
@@ -232,10 +240,19 @@ class Teller:
             self._broken_at = now
             raise
         self._watch.wrote(velocity, now)
+        self._reached = self._hearers
         self._written.append(self._watch.told)
         self._left_at = self._heard_at if self._sent else now
         self._put(self._watch.told)
         return True
+
+    def _misses_some(self) -> bool:
+        """Whether the other one told the wheels something last, and somebody did not listen to it who does to this one.
+
+        Their connection to it may be broken, or still on its way.
+        """
+        other = self._board.of(_OTHER[self._role])
+        return not (isnan(other.told.at) or other.told.at <= self._own.at) and not self._hearers <= other.hearers
 
     def _end_other(self, now: float) -> None:
         """Whose place this one takes, or has taken, and who stands still with a word that would come later."""
@@ -329,7 +346,7 @@ class Teller:
 
     def _put(self, told: LastCommand, claim: float | None = None) -> None:
         self._own, self._claim = told, self._claim if claim is None else claim
-        self._board.put(self._role, Entry(self._own, self._claim, self._left_at))
+        self._board.put(self._role, Entry(self._own, self._claim, self._left_at, self._reached))
 
 
 _OTHER = {Role.FIRST: Role.SECOND, Role.SECOND: Role.FIRST}

@@ -68,6 +68,10 @@ class SocketWheels:
         """Wheels: not known; a driver that starts anew is a write that fails."""
         return None
 
+    def hearers(self) -> frozenset[str]:
+        """Wheels: not known."""
+        return frozenset()
+
     def close(self) -> None:
         """Close the socket."""
         if self._socket is not None:

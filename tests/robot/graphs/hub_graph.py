@@ -155,6 +155,9 @@ class HubWheels:
     def listeners(self) -> None:
         return None
 
+    def hearers(self) -> frozenset[str]:
+        return frozenset()
+
 
 class HubDisplay:
     def __init__(self, way: HubWay, topic: str) -> None:

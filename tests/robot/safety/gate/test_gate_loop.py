@@ -61,6 +61,9 @@ class Hardware:
     def listeners(self) -> None:
         return None
 
+    def hearers(self) -> frozenset[str]:
+        return frozenset()
+
     def close(self) -> None:
         """Nothing is open."""
 

@@ -47,6 +47,8 @@ class Way:
     def listeners(self):
         return frozenset({"/base"})
 
+    hearers = listeners
+
     def enable(self, level):
         """There is no enable signal."""
 

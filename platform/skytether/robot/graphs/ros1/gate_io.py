@@ -50,6 +50,7 @@ class Ros1Wheels(RosWheels[Node]):
         self._fresh_s = timing.fresh_s
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._heard: Heard | None = None
+        self._names = frozenset[str]()
         super().__init__(_start(way, role))
         if place:
             place.keep()
@@ -98,7 +99,12 @@ class Ros1Wheels(RosWheels[Node]):
         self._renewed = self._publication.renewed  # before them: who comes meanwhile counts as new
         names = self._publication.subscribers
         self._look_for(self._nodes, names, self._publication.topic)
-        return frozenset(f"{name} {self._renewed}" for name in names if not self._nodes or name in self._nodes)
+        self._names = frozenset(name for name in names if not self._nodes or name in self._nodes)
+        return frozenset(f"{name} {self._renewed}" for name in self._names)
+
+    def hearers(self) -> frozenset[str]:
+        """Wheels: these nodes."""
+        return self._names
 
 
 class Ros1Sensors(RosSensors[Node]):

@@ -52,6 +52,7 @@ class Ros2Wheels(RosWheels[GraphNode]):
         self, way: Ros2Way, role: str, timing: WheelsTiming, enable_topic: str = "", place: Place | None = None
     ) -> None:
         self._way, self._place = way, place
+        self._lives = frozenset[str]()
         super().__init__(_start(way, role, place))
         self._clock = GraphClock(self._node)
         self._topic = resolve(way.cmd_vel, way.namespace)
@@ -100,15 +101,19 @@ class Ros2Wheels(RosWheels[GraphNode]):
             return frozenset()
         if self._way.cmd_vel_type == TwistStamped.TYPE:
             self._clock()  # or the gate would hear no time before its first velocity
-        lives = self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes)
+        lives = self._lives = frozenset(self._node.lives(self._topic, Kind.SUBSCRIPTION, self._nodes))
         self._renewed = self._publication.renewed
         if self._nodes:
             there = [endpoint.node for endpoint in self._node.endpoints(self._topic, Kind.SUBSCRIPTION)]
             self._look_for(self._nodes, there, self._topic)
         if self._renewed is None:
-            return frozenset(lives)
+            return lives
         # When who comes, or comes in another's place, is to hear a first word, who publishes knows sooner.
         return frozenset({str(self._renewed)} if lives else ())
+
+    def hearers(self) -> frozenset[str]:
+        """Wheels: these nodes' endpoints."""
+        return self._lives
 
     def sent(self) -> Sent:
         """Wheels: what the program has published, or cannot."""
