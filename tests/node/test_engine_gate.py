@@ -186,10 +186,17 @@ class Engine:
         return [line for line, _, _ in self.asked]
 
 
+class Groups(Cgroups):
+    """Of these a container runs that has none, too."""
+
+    def go_on(self, container: str) -> bool:
+        return container not in self._folders or super().go_on(container)
+
+
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Engine]:
     monkeypatch.setattr("skytether.node.removals.Cgroups", lambda: Cgroups(tmp_path))  # those of this machine's own
-    monkeypatch.setattr("skytether.node.joins.Cgroups", lambda: Cgroups(tmp_path))
+    monkeypatch.setattr("skytether.node.joins.Cgroups", lambda: Groups(tmp_path))
     monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: True)  # its containers have no processes
     monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
@@ -952,7 +959,7 @@ def test_who_joined_the_network_of_one_that_ended_meanwhile_is_ended(engine: Eng
     group = tmp_path / "pids" / "docker" / X
     group.mkdir(parents=True)
     (tmp_path / "pids" / "cgroup.procs").write_text("")
-    (group / "tasks").write_text("7\n" if by == "the kernel" else "")
+    (group / "tasks").write_text("7\n")
 
     async def run() -> None:
         site = Site(engine)

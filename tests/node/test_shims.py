@@ -33,6 +33,7 @@ def proc(tmp_path, beside):
     (tmp_path / str(beside.pid)).symlink_to(f"/proc/{beside.pid}")
     (tmp_path / str(FIRST)).mkdir()
     (tmp_path / "self").mkdir()
+    (tmp_path / "1").symlink_to("/proc/1")
     first(tmp_path, beside.pid)
     return tmp_path
 
@@ -56,21 +57,35 @@ def test_it_stops_and_goes_on(proc, beside):
     shims.let_go_on(ONE, proc)
 
 
-@pytest.mark.parametrize("beside", ["sshd", "python3"], indirect=True)
+@pytest.mark.parametrize("beside", ["conmon", "python3"], indirect=True)
 def test_nothing_else_is_stopped(proc, beside):
-    assert not shims.stop(ONE, FIRST, proc)
+    assert shims.stop(ONE, FIRST, proc) is None
     assert state_of(beside) != "T"
 
 
+def test_nobody_knows_of_what_is_hidden(proc, beside):
+    (proc / "1").unlink()
+    assert shims.stop(ONE, FIRST, proc) is None
+    assert state_of(beside) != "T"
+
+
+def test_one_of_another_user_cannot_be_stopped(proc, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    assert shims.stop(ONE, FIRST, proc) is None
+
+
 def test_that_of_another_container_is_not_stopped(proc, beside):
-    assert not shims.stop(OTHER, FIRST, proc)
+    assert shims.stop(OTHER, FIRST, proc) is False
     assert state_of(beside) != "T"
 
 
 @pytest.mark.parametrize("how", [{"state": "Z"}, {"state": "X"}, {"container": OTHER}])
 def test_the_number_of_one_that_ended_is_not_its_own(proc, beside, how):
     first(proc, beside.pid, **how)
-    assert not shims.stop(ONE, FIRST, proc)
+    assert shims.stop(ONE, FIRST, proc) is False
     shims.let_go_on(ONE, proc)
     assert state_of(beside) != "T"
 
@@ -78,15 +93,15 @@ def test_the_number_of_one_that_ended_is_not_its_own(proc, beside, how):
 def test_one_whose_parent_is_another_one_by_now_has_ended(proc, monkeypatch):
     send = signal.pidfd_send_signal
     monkeypatch.setattr(signal, "pidfd_send_signal", lambda *words: (send(*words), first(proc, 1)))
-    assert not shims.stop(ONE, FIRST, proc)
+    assert shims.stop(ONE, FIRST, proc) is False
 
 
 @pytest.mark.parametrize("number", [None, 0, FIRST + 1, "4/../.."])
 def test_a_number_that_is_nobodys_is_not_its_own(proc, number):
-    assert not shims.stop(ONE, number, proc)
+    assert shims.stop(ONE, number, proc) is False
 
 
 def test_what_does_not_stop_holds_nothing(proc, monkeypatch):
     monkeypatch.setattr(shims, "_STOPS_S", 0.0)
     monkeypatch.setattr(signal, "pidfd_send_signal", lambda *_: None)
-    assert not shims.stop(ONE, FIRST, proc)
+    assert shims.stop(ONE, FIRST, proc) is False

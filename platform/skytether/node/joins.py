@@ -34,6 +34,7 @@ _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
 _ENDS = "the container whose network it joins is being ended"
+_HAS_ENDED = "the container whose network it joins has ended, as far as the kernel shows it (/proc, /sys/fs/cgroup)"
 _ENDED = "the container whose network it joined ended meanwhile: it was ended, too"
 
 
@@ -42,7 +43,11 @@ class BusyError(Exception):
 
 
 class Life:
-    """Of a container, from now on until it ends: it may be started again after that, and is another one then."""
+    """Of a container, from now on until it ends: it may be started again after that, and is another one then.
+
+    An engine may say for seconds of one that has ended that it runs. So the kernel is asked, too: its first process is
+    its last, and has its number so long.
+    """
 
     def __init__(self, engine: str, container: str) -> None:
         """``engine``: path of its socket. `begin` comes next."""
@@ -53,20 +58,18 @@ class Life:
     async def begin(self) -> Self:
         """Look at it first."""
         with contextlib.suppress(OSError):
-            cgroups = await asyncio.to_thread(Cgroups)
-            self._cgroups = cgroups if cgroups.go_on(self._container) else None
+            self._cgroups = await asyncio.to_thread(Cgroups)
         self._told = await self._ask()
         return self
 
     def has_ended(self) -> bool:
-        """By the kernel's word, where that can be seen: its first process is its last, and has its number so long."""
-        return self._cgroups is not None and not self._cgroups.go_on(self._container)
+        """By the kernel's word; so it is, too, where the kernel does not show it."""
+        return self._cgroups is None or not self._cgroups.go_on(self._container)
 
     async def goes_on(self) -> bool:
         """Whether it has not ended, as far as is known."""
         told = await self._ask()  # first: what the kernel says after that is the newer word
-        same = told == self._told or (told is None and self._cgroups is not None)
-        return self.is_known() and same and not self.has_ended()
+        return self.is_known() and told in (self._told, None) and not self.has_ended()
 
     def is_known(self) -> bool:
         """Whether it was there at first."""
@@ -117,17 +120,18 @@ class Joins:
             async with self._pauses.setdefault(joined, asyncio.Lock()):
                 if joined in self._ending:
                     raise BusyError(_ENDS)
-                held = None
+                paused = None
                 try:
-                    held = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
-                    if held.status >= HTTPStatus.BAD_REQUEST:
-                        return held  # it has ended, or is about to, or somebody else has it paused
+                    paused = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
+                    if paused.status >= HTTPStatus.BAD_REQUEST:
+                        return paused  # it has ended, or is about to, or somebody else has it paused
                     life = await Life(self._engine, joined).begin()
                     if not life.is_known():
                         raise BusyError("its engine says nothing of the container whose network it joins")
-                    self._note(await asyncio.to_thread(shims.stop, joined, life.first()))
-                    if life.has_ended():
-                        raise BusyError("the container whose network it joins has ended")
+                    held = await asyncio.to_thread(shims.stop, joined, life.first())
+                    if held is False or life.has_ended():
+                        raise BusyError(_HAS_ENDED)
+                    self._note(held)
                     starts = begun(ask_long(self._engine, path, method="POST"))
                     while not starts.done():
                         await asyncio.wait((starts,), timeout=_LOOK_S)
@@ -138,7 +142,7 @@ class Joins:
                         return conflict(_ENDED)
                     return starts.result()
                 finally:
-                    if held is None or held.status < HTTPStatus.BAD_REQUEST:
+                    if paused is None or paused.status < HTTPStatus.BAD_REQUEST:
                         await self._go_on(joined)
         finally:
             self._has_joined(joined)
@@ -165,8 +169,8 @@ class Joins:
             return False
         return answer.status < HTTPStatus.INTERNAL_SERVER_ERROR
 
-    def _note(self, stopped: bool) -> None:
-        if not stopped and not self._noted:
+    def _note(self, held: bool | None) -> None:
+        if held is None and not self._noted:
             self._noted = True
             log.warning(
                 "its engine's processes beside containers cannot be stopped (another user's, or hidden from this one): "

@@ -19,7 +19,7 @@ _STOPS_S = 1.0
 """For the kernel to stop all its threads."""
 
 
-def stop(container: str, first: object, proc: Path = PROC) -> bool:
+def stop(container: str, first: object, proc: Path = PROC) -> bool | None:
     """Stop that of a container that runs. `let_go_on` comes next, whatever this says.
 
     Args:
@@ -28,19 +28,27 @@ def stop(container: str, first: object, proc: Path = PROC) -> bool:
         proc: Where the kernel shows processes.
 
     Returns:
-        Whether that number is this container's until then. It is not where the engine has no such process, one of
-        another user, or one that is hidden; and where the container has ended.
+        Whether that number is this container's until then: not if it has ended. None: nobody can see to that, for
+        processes are hidden from this one, or the engine has no such process, or it is another user's.
     """
+    if not (proc / "1" / "stat").exists():
+        return None
     try:
-        shim = int(_stat(proc / str(first))[1])
-        if not _signal(shim, container, signal.SIGSTOP, proc) or not _has_stopped(proc / str(shim)):
+        if not _is_first(container, proc / str(first)):
             return False
+        shim = int(_stat(proc / str(first))[1])
+        if not _signal(shim, container, signal.SIGSTOP, proc):
+            return None
         # Who is in its group is the container's own: so that number was, too, when it was asked whose child it is.
-        group = (proc / str(first) / "cgroup").read_text()
-        state, parent, *_ = _stat(proc / str(first))
+        return (
+            _has_stopped(proc / str(shim))
+            and _is_first(container, proc / str(first))
+            and int(_stat(proc / str(first))[1]) == shim
+        )
+    except PermissionError:
+        return None
     except (OSError, ValueError, IndexError):
         return False
-    return container in group and state not in _ENDED and int(parent) == shim
 
 
 def let_go_on(container: str, proc: Path = PROC) -> None:
@@ -69,6 +77,11 @@ def _signal(process: int, container: str, number: signal.Signals, proc: Path) ->
 
 def _is_shim(words: list[bytes], container: str) -> bool:
     return Path(os.fsdecode(words[0])).name.startswith(_NAME) and container.encode() in words
+
+
+def _is_first(container: str, folder: Path) -> bool:
+    """Whether a process is of that container, and has not ended: of one that has, the group may be another."""
+    return container in (folder / "cgroup").read_text() and _stat(folder)[0] not in _ENDED
 
 
 def _has_stopped(folder: Path) -> bool:

@@ -6,6 +6,7 @@ import threading
 import pytest
 from ros1_graph import wait_for
 
+from skytether.guard.clock import now
 from skytether.messages import String, decode, encode, type_hash
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.services import CallRefusedError, ServiceType
@@ -117,6 +118,20 @@ def test_a_real_subscriber_hears_everything_in_order_and_tools_know_the_node(gra
     assert "/ours [std_msgs/String]" in info
     assert "to: /listener" in info
     assert "xmlrpc reply" in graph.ask("rosnode", "ping", "-c", "1", "/skytether")
+
+
+def test_a_node_of_rospy_whose_connection_is_reset_comes_back(graph, node):
+    """It does not by itself: wheels heard nothing any more, and their gate did not know of it."""
+    ours = node.advertise("/ours", STRING, MD5)
+    listener = graph.python(LISTENER, "listener", "/ours", stdout=subprocess.PIPE)
+    for word in ("before", "after"):
+        wait_for(lambda: ours.subscribers == ["/listener"], "the listener")
+        ours.publish(
+            encode(String(word), "ros1"), now() + 10
+        )  # what is too old one day is not sent after a close: reset
+        assert listener.stdout.readline().decode() == f"{word}\n"
+        node.soon(ours.close)
+        wait_for(lambda: ours.subscribers == [], "the end of its connection")
 
 
 def test_another_type_is_refused_on_both_sides_with_both_sums_named_once(graph, node, caplog):

@@ -170,6 +170,48 @@ def test_where_it_is_known_who_turns_the_wheels_nobody_else_counts():
     run(work, awaited=["/base"])
 
 
+def test_a_node_whose_connection_has_ended_is_missed_for_as_long_as_it_wants_the_topic():
+    now, graph = [100.0], ["/you", "/other"]
+
+    def missed():
+        return publications[0].is_missed(lambda: graph)
+
+    async def leave(publication, connect, caller="/you"):
+        _, writer, _ = await connect(callerid=caller)
+        writer.close()
+        while publication.subscribers:
+            await asyncio.sleep(0.001)
+
+    publications = []
+
+    async def work(publication, connect):
+        publications.append(publication)
+        await leave(publication, connect)
+        assert not missed(), "it may be about to come back"
+        at = []
+        for step in range(200):
+            now[0] = 101.0 + step
+            at += [step] if missed() else []
+        assert at == [0, 2, 6, 14, 30], "it may have crashed"
+        await leave(publication, connect)
+        now[0] += 1.0
+        assert missed()
+        _, writer, _ = await connect()
+        while not publication.subscribers:
+            await asyncio.sleep(0.001)
+        now[0] += 100.0
+        assert not missed(), "it is back"
+        writer.close()
+        while publication.subscribers:
+            await asyncio.sleep(0.001)
+        await leave(publication, connect, "/left")
+        now[0] += 1.0
+        graph.remove("/you")
+        assert not missed(), "they want it no more"
+
+    run(work, clock=lambda: now[0])
+
+
 def test_what_is_too_old_by_the_time_that_it_is_sent_is_not():
     """The process stood still between `publish` and the thread of the node, or before a slow subscriber had room."""
     now = 100.0

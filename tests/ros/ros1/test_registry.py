@@ -32,6 +32,11 @@ class Entry:
         self.name = name
         self.refused = refused
         self.nonsense = False
+        self.missed = False
+
+    def is_missed(self, master):
+        self.check(master)
+        return self.missed
 
     def check(self, master):
         master.check()
@@ -80,6 +85,21 @@ def test_a_master_that_forgot_us_is_told_everything_again(master, registry, capl
     registry.step()
     assert master.told == ["+a", "+a"]
     assert "was restarted" in caplog.text
+
+
+def test_what_is_missed_is_told_the_master_again(master, registry):
+    a, b = Entry("a"), Entry("b")
+    registry.want(a)
+    registry.want(b)
+    registry.step()
+    a.missed = True
+    registry.step()
+    a.missed = False
+    registry.step()
+    assert master.told == ["+a", "+b", "+a"]
+    b.nonsense = True
+    registry.step()
+    assert registry.present
 
 
 def test_another_node_of_our_name_is_told_from_a_master_that_was_restarted(master, registry, caplog):

@@ -182,10 +182,17 @@ class Master:
 
     def publishers(self, topic: str) -> list[str]:
         """Names of the nodes that offer a topic now."""
-        offered: Any = next(iter(self._list("getSystemState")), None)
-        if not _is_list(offered) or not all(_is_list(row, 2) and _is_list(row[1]) for row in offered):
+        return self._nodes_of(topic, 0)
+
+    def subscribers(self, topic: str) -> list[str]:
+        """Names of the nodes that take a topic now, as far as they have not taken that back."""
+        return self._nodes_of(topic, 1)
+
+    def _nodes_of(self, topic: str, kind: int) -> list[str]:
+        rows: Any = next(iter(self._list("getSystemState")[kind:]), None)
+        if not _is_list(rows) or not all(_is_list(row, 2) and _is_list(row[1]) for row in rows):
             raise NonsenseError(f"{self.uri} does not speak as ROS does (getSystemState): it answers no such list")
-        return [str(node) for name, nodes in offered if name == topic for node in nodes]
+        return [str(node) for name, nodes in rows if name == topic for node in nodes]
 
     def get_param(self, name: str) -> Any:
         """A parameter, or a namespace of them as a mapping.

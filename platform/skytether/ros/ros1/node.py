@@ -64,6 +64,9 @@ class _Subscribed:
     def unregister(self, master: Master) -> None:
         master.unregister_subscriber(self.subscription.topic, self.node.uri)
 
+    def is_missed(self, _: Master) -> bool:
+        return False
+
 
 @dataclass(eq=False)
 class _Published:
@@ -80,6 +83,9 @@ class _Published:
     def unregister(self, master: Master) -> None:
         master.unregister_publisher(self.publication.topic, self.node.uri)
 
+    def is_missed(self, master: Master) -> bool:
+        return self.publication.is_missed(partial(master.subscribers, self.publication.topic))
+
 
 @dataclass(eq=False)
 class _Served:
@@ -95,6 +101,9 @@ class _Served:
 
     def unregister(self, master: Master) -> None:
         master.unregister_service(self.server.name, self.node.rosrpc)
+
+    def is_missed(self, _: Master) -> bool:
+        return False
 
 
 class Node:

@@ -33,6 +33,8 @@ _WRITTEN_BYTES = 2**16
 _HANDOVER = 1000
 """Messages on the way from other threads to the node's; they wait there for milliseconds."""
 _MAX_SUBSCRIBERS = 256
+_MISSED_S, _MOST_MISSED = 1.0, 5
+"""Until a node is told anew that this one publishes, doubled each time, and how often it is."""
 _MOST_UNREAD = 4096
 """Frames of which it is known when they were put."""
 
@@ -216,6 +218,8 @@ class Publication:
         self._awaited = frozenset(awaited)
         self._comers, self._began = Comers(awaited), clock()
         self._refused: set[tuple[str, str]] = set()
+        self._missed: dict[str, tuple[int, float]] = {}
+        """Nodes whose connections have ended: how often each was told anew, and when it is next [s]."""
 
     @property
     def subscribers(self) -> list[str]:
@@ -270,12 +274,15 @@ class Publication:
             if time.monotonic() < until:
                 subscriber.send(_Frame(frame))
         self._subscribers.append(subscriber)
+        self._missed.pop(caller, None)
         self.renewed += self._is_anybody_back()
         try:
             while await reader.read(4096):
                 pass
         finally:
             self._subscribers.remove(subscriber)
+            if caller not in self.subscribers and len(self._missed) < _MAX_SUBSCRIBERS:
+                self._missed[caller] = (0, self._clock() + _MISSED_S)
             self._is_anybody_back()
             subscriber.close()
 
@@ -287,6 +294,24 @@ class Publication:
         there = [one for one in list(self._subscribers) if not self._awaited or one.caller in self._awaited]
         unread = tuple(one.caller for one in there if one.see_read() > patience_s)
         return Heard(min(one.read_at for one in there), unread) if there else None
+
+    def is_missed(self, wanted: Callable[[], Collection[str]]) -> bool:
+        """Whether a node wants the topic still whose connection has ended, and does not connect by itself.
+
+        A node of rospy does not, once a connection was reset. From one thread, any.
+
+        Args:
+            wanted: Names of the nodes that want it, as the master knows them; one that crashed is among them.
+        """
+        now = self._clock()
+        due = {name: tried for name, (tried, at) in list(self._missed.items()) if at <= now}
+        known = wanted() if due else ()
+        for name, tried in due.items():
+            if name not in known or tried >= _MOST_MISSED:
+                self._missed.pop(name, None)
+            elif name in self._missed:
+                self._missed[name] = (tried + 1, now + _MISSED_S * 2 ** (tried + 1))
+        return any(name in self._missed for name in due)
 
     def _is_anybody_back(self) -> bool:
         there = {each: each.caller for each in self._subscribers}

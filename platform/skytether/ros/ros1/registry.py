@@ -2,7 +2,8 @@
 
 Each round asks whether the master knows this node. A restarted master does not: everything is registered again. A
 master that is away is waited for; that is said once, and so is its return. What it answers nonsense for is named once
-and asked again each round, and does not keep the rest from being registered.
+and asked again each round, and does not keep the rest from being registered. What is missed is registered again, too:
+the master then tells the others of it anew.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Protocol
 
 from .master import Master, MasterError, NonsenseError, RefusedError
@@ -36,6 +38,10 @@ class Entry(Protocol):
 
     def unregister(self, master: Master) -> None:
         """Take it back; raises MasterError."""
+        ...
+
+    def is_missed(self, master: Master) -> bool:
+        """Whether other nodes are to hear of it anew, by its being registered again; raises MasterError."""
         ...
 
 
@@ -129,6 +135,10 @@ class Registry:
         for entry in missing:
             if self._call_master(entry.register, entry.name, wrong):
                 self._done.append(entry)
+        for entry in () if self._held else self._done:
+            with suppress(NonsenseError):
+                if entry.is_missed(self._master):
+                    self._call_master(entry.register, entry.name, wrong)
         return wrong
 
     def _call_master(self, tell: Callable[[Master], None], name: str, wrong: dict[str, NonsenseError]) -> bool:
