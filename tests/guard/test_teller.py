@@ -334,7 +334,7 @@ def test_whom_the_first_did_not_reach_hears_a_standstill_first_of_the_second(bot
 
 def test_who_came_after_the_last_word_did_not_hear_it(both):
     """The gate claims, which it writes down, too, once it has somebody who listens."""
-    first, second = both
+    first, _ = both
     for i in range(20):
         first.turn(1.0 + i * PERIOD, FAST)
     known = first.board.of(Role.FIRST).hearers
