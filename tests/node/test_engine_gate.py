@@ -989,6 +989,45 @@ def test_nobody_joins_the_network_of_one_that_had_ended_just_before(engine: Engi
     assert f"POST /v1.41/containers/{Y}/start" not in engine.lines
 
 
+@pytest.mark.parametrize("by", ["number", "group"])
+def test_nobody_joins_the_network_of_one_that_has_ended_whatever_the_engine_says(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    """It says for seconds that it runs, where somebody else has a pipe of its health check: J was in the machine's."""
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        if by == "number":
+            monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: False)
+        else:
+            (tmp_path / "pids" / "docker" / X).mkdir(parents=True)
+            (tmp_path / "pids" / "cgroup.procs").write_text("")
+            (tmp_path / "pids" / "docker" / X / "tasks").write_text("")
+        said = await site.ask(f"POST /v1.41/containers/{Y}/start")
+        assert b"whose network it joins has ended, as far as the kernel shows it" in said
+
+    asyncio.run(run())
+    assert f"POST /v1.41/containers/{Y}/start" not in engine.lines
+    assert engine.lines[-1] == f"POST /containers/{X}/unpause"
+
+
+def test_where_no_number_can_be_held_that_is_told_once(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: None)
+    engine.others = {one: in_volumes(network=f"container:{X}") for one in (Y, Z)} | {X: in_volumes()}
+
+    async def run() -> None:
+        site = Site(engine)
+        for one in (X, Y, Z):
+            await site.start(one)
+
+    asyncio.run(run())
+    assert caplog.text.count("cannot be stopped") == 1
+
+
 @pytest.mark.parametrize("ended", ["before", "after"])
 def test_who_joins_by_what_an_earlier_program_asked_for_is_ended_where_that_ended_meanwhile(
     engine: Engine, ended: str, monkeypatch: pytest.MonkeyPatch

@@ -128,7 +128,7 @@ class Joins:
                     life = await Life(self._engine, joined).begin()
                     if not life.is_known():
                         raise BusyError("its engine says nothing of the container whose network it joins")
-                    held = await asyncio.to_thread(shims.stop, joined, life.first())
+                    held = shims.stop(joined, life.first())  # in no thread: that would go on when this has ended
                     if held is False or life.has_ended():
                         raise BusyError(_HAS_ENDED)
                     self._note(held)

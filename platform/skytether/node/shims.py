@@ -15,7 +15,7 @@ from pathlib import Path
 PROC = Path("/proc")
 _NAME = "containerd-shim"
 _ENDED = "ZX"
-_STOPS_S = 1.0
+_STOPS_S = 0.2
 """For the kernel to stop all its threads."""
 
 
