@@ -585,10 +585,10 @@ def test_an_entry_that_was_not_written_to_its_end_leaves_the_one_before():
 
 def test_of_very_many_who_listen_some_are_written_down():
     file = board.make()
-    page, many = Board(file), frozenset(map(mark, map(str, range(40))))
+    page, many = Board(file), frozenset(map(mark, map(str, range(60))))
     page.put(Role.FIRST, Entry(LastCommand(FAST, 1.0), 1.0, 1.0, many))
     assert page.of(Role.FIRST).hearers < many
-    assert len(page.of(Role.FIRST).hearers) == 16
+    assert len(page.of(Role.FIRST).hearers) == 48
     os.close(file)
 
 

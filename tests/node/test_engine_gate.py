@@ -1013,6 +1013,20 @@ def test_nobody_joins_the_network_of_one_that_has_ended_whatever_the_engine_says
     assert engine.lines[-1] == f"POST /containers/{X}/unpause"
 
 
+def test_a_program_that_ends_leaves_what_is_joined_to_the_next_one(engine: Engine) -> None:
+    """It let it go on, and the engine went on with the start: who joined was in the network of the machine for good."""
+    engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
+
+    async def run() -> None:
+        site = Site(engine)
+        await site.start(X)
+        await site.begin(Y)
+
+    asyncio.run(run())
+    assert f"POST /containers/{X}/pause" in engine.lines
+    assert f"POST /containers/{X}/unpause" not in engine.lines
+
+
 def test_where_no_number_can_be_held_that_is_told_once(
     engine: Engine, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

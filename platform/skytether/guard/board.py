@@ -23,10 +23,10 @@ from .kernel_buffers import is_anything_unacknowledged
 from .protocol import LastCommand
 from .velocity import Velocity
 
-_MOST_HEARERS = 16
+_MOST_HEARERS = 48
 _ENTRY = struct.Struct(f"<Qddddd{_MOST_HEARERS}Q")
 _SUM = struct.Struct("<I")
-_SLOT = 256
+_SLOT = 512
 """Bytes between two entries: no two in one line of the processor's cache."""
 _SIZE = 4096
 _LOCK = struct.Struct("hhqqi0q")

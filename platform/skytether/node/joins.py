@@ -120,7 +120,7 @@ class Joins:
             async with self._pauses.setdefault(joined, asyncio.Lock()):
                 if joined in self._ending:
                     raise BusyError(_ENDS)
-                paused = None
+                paused, ends = None, False
                 try:
                     paused = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if paused.status >= HTTPStatus.BAD_REQUEST:
@@ -141,8 +141,11 @@ class Joins:
                         await self.end_joined(container)
                         return conflict(_ENDED)
                     return starts.result()
+                except asyncio.CancelledError:
+                    ends = True  # this program does, and the engine goes on with that start: the next lets both go on
+                    raise
                 finally:
-                    if paused is None or paused.status < HTTPStatus.BAD_REQUEST:
+                    if not ends and (paused is None or paused.status < HTTPStatus.BAD_REQUEST):
                         await self._go_on(joined)
         finally:
             self._has_joined(joined)

@@ -6,6 +6,7 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
@@ -50,7 +51,7 @@ class Ros1Wheels(RosWheels[Node]):
         self._fresh_s = timing.fresh_s
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._heard: Heard | None = None
-        self._names = frozenset[str]()
+        self._names: list[str] = []
         super().__init__(_start(way, role))
         if place:
             place.keep()
@@ -99,12 +100,12 @@ class Ros1Wheels(RosWheels[Node]):
         self._renewed = self._publication.renewed  # before them: who comes meanwhile counts as new
         names = self._publication.subscribers
         self._look_for(self._nodes, names, self._publication.topic)
-        self._names = frozenset(name for name in names if not self._nodes or name in self._nodes)
+        self._names = [name for name in names if not self._nodes or name in self._nodes]
         return frozenset(f"{name} {self._renewed}" for name in self._names)
 
     def hearers(self) -> frozenset[str]:
-        """Wheels: these nodes."""
-        return self._names
+        """Wheels: these nodes, each as often as it is connected."""
+        return frozenset(f"{name} {number}" for name, count in Counter(self._names).items() for number in range(count))
 
 
 class Ros1Sensors(RosSensors[Node]):
