@@ -181,10 +181,10 @@ class Joins:
             )
 
     async def _go_on(self, container: str) -> None:
-        await asyncio.to_thread(shims.let_go_on, container)  # nobody ends a container, or has it go on, without it
         for wait_s in _TRY_S:
             await asyncio.sleep(wait_s)
             with contextlib.suppress(OSError, ValueError):
+                await asyncio.to_thread(shims.let_go_on, container)  # nobody has a container go on without it
                 answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
                 if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
                     return
