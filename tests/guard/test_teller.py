@@ -332,6 +332,26 @@ def test_whom_the_first_did_not_reach_hears_a_standstill_first_of_the_second(bot
     assert (second.wheels.told[before] == STANDSTILL) is not reached
 
 
+def test_a_standstill_that_was_not_sent_was_not_told(both):
+    """Who was held up in the turn in which it took over found its own entry, and went on from the other one's."""
+    first, second = both
+    second.wheels.nodes = second.wheels.names = frozenset({"/base", "/recorder"})
+    for one in (frozenset[str](), second.wheels.names):
+        second.wheels.nodes = one
+        second.turn(-9.0)
+    for i in range(20):
+        first.turn(1.0 + i * PERIOD, FAST)
+    assert not second.turn(1.42)
+    second.late = 0.016
+    assert not second.turn(1.44)
+    second.late = 0.0
+    first.board.put(Role.FIRST, Entry(LastCommand(FAST, 1.445), left_at=1.445, hearers=frozenset({mark("/base")})))
+    turn = 1.44
+    while not second.wheels.told:
+        second.turn(turn := turn + PERIOD)
+    assert second.wheels.told == [STANDSTILL]
+
+
 def test_who_came_after_the_last_word_did_not_hear_it(both):
     """The gate claims, which it writes down, too, once it has somebody who listens."""
     first, _ = both

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from http import HTTPStatus
@@ -19,7 +19,7 @@ import pytest
 from gated_engine import ENGINE, Gated, gate_at, gated
 
 from skytether.node import shims
-from skytether.node.machine import ask
+from skytether.node.machine import Answer, ask
 
 __all__ = ["gated"]
 pytestmark = [pytest.mark.docker, pytest.mark.slow]
@@ -75,7 +75,7 @@ def test_who_joins_the_network_of_one_that_ends_meanwhile_is_in_no_other(
         monkeypatch: Has it not be kept.
     """
     if not held:
-        monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: False)
+        monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: None)
     gated.network()
     holds, _ = gated.make()
     joins, _ = gated.make(network=f"container:{holds}", starts=False)
@@ -124,6 +124,32 @@ def test_what_an_earlier_program_stopped_goes_on(gated: Gated) -> None:
         again = Gated(str(Path(folder) / "gate.sock"), gated.name)
         assert again.ask(f"POST /containers/{holds}/kill?signal=KILL").status == HTTPStatus.NO_CONTENT
         assert again.ask(f"POST /containers/{holds}/wait").status == HTTPStatus.OK
+
+
+def test_somebody_else_can_end_a_container_whose_network_is_joined(
+    gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The engine waits for the shim then, which is stopped, and the start for which it is stopped waits for the engine."""
+    gated.network()
+    holds, _ = gated.make()
+    joins, _ = gated.make(network=f"container:{holds}", starts=False)
+    stop, ends = shims.stop, list[Future[Answer]]()
+    monkeypatch.setattr("skytether.node.joins._LONG_S", 1.0)
+    with ThreadPoolExecutor() as pool:
+
+        def stop_and_end(container: str, first: object) -> bool | None:
+            held = stop(container, first)
+            kill = f"/containers/{container}/kill?signal=KILL"
+            ends.append(pool.submit(ask, ENGINE, kill, method="POST", patience=60))
+            time.sleep(0.5)
+            return held
+
+        monkeypatch.setattr("skytether.node.joins.shims.stop", stop_and_end)
+        said = pool.submit(gated.ask, f"POST /containers/{joins}/start").result(60)
+        assert ends[0].result(60).status == HTTPStatus.NO_CONTENT
+    assert said.status >= HTTPStatus.BAD_REQUEST
+    for one in (holds, joins):
+        assert json.loads(ask(ENGINE, f"/containers/{one}/json").content)["State"]["Running"] is False
 
 
 def _runtime_of(container: str) -> int | None:

@@ -1,6 +1,6 @@
 """The process beside a container is stopped, and goes on; nobody else's is."""
 
-import signal
+import os
 import subprocess
 import sys
 import time
@@ -50,11 +50,11 @@ def state_of(process):
 def test_it_stops_and_goes_on(proc, beside):
     assert shims.stop(ONE, FIRST, proc)
     assert state_of(beside) == "T"
-    shims.let_go_on(OTHER, proc)
+    shims.resume(OTHER, proc)
     assert state_of(beside) == "T"
-    shims.let_go_on(ONE, proc)
+    shims.resume(ONE, proc)
     assert state_of(beside) != "T"
-    shims.let_go_on(ONE, proc)
+    shims.resume(ONE, proc)
 
 
 @pytest.mark.parametrize("beside", ["conmon", "python3"], indirect=True)
@@ -73,7 +73,7 @@ def test_one_of_another_user_cannot_be_stopped(proc, monkeypatch):
     def refuse(*_):
         raise PermissionError
 
-    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    monkeypatch.setattr(os, "kill", refuse)
     assert shims.stop(ONE, FIRST, proc) is None
 
 
@@ -86,13 +86,13 @@ def test_that_of_another_container_is_not_stopped(proc, beside):
 def test_the_number_of_one_that_ended_is_not_its_own(proc, beside, how):
     first(proc, beside.pid, **how)
     assert shims.stop(ONE, FIRST, proc) is False
-    shims.let_go_on(ONE, proc)
+    shims.resume(ONE, proc)
     assert state_of(beside) != "T"
 
 
 def test_one_whose_parent_is_another_one_by_now_has_ended(proc, monkeypatch):
-    send = signal.pidfd_send_signal
-    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *words: (send(*words), first(proc, 1)))
+    kill = os.kill
+    monkeypatch.setattr(os, "kill", lambda *words: (kill(*words), first(proc, 1)))
     assert shims.stop(ONE, FIRST, proc) is False
 
 
@@ -103,5 +103,5 @@ def test_a_number_that_is_nobodys_is_not_its_own(proc, number):
 
 def test_what_does_not_stop_holds_nothing(proc, monkeypatch):
     monkeypatch.setattr(shims, "_STOPS_S", 0.0)
-    monkeypatch.setattr(signal, "pidfd_send_signal", lambda *_: None)
+    monkeypatch.setattr(os, "kill", lambda *_: None)
     assert shims.stop(ONE, FIRST, proc) is False

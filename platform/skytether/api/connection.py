@@ -195,7 +195,7 @@ class Connection:
                 if last or alone:
                     raise
             except httpx.TimeoutException:
-                if last or alone or not again:
+                if last or alone or not again or patience is not None:  # it may be about it still
                     raise
             except httpx.TransportError:  # a connection that was kept open, and that the other end has closed
                 if last or not again:

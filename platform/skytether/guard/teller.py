@@ -152,6 +152,8 @@ class Teller:
         self._listeners: frozenset[str] | None = frozenset()
         self._strangers_at = -inf
         """When others came in the place of all who had listened, or the first ones did [s]."""
+        self._spoke_at = -inf
+        """When this one last told the wheels something, and not just had them counted as standing [s]."""
         self._names, self._hearers = frozenset[str](), frozenset[int]()
         """Who listens, and as the board knows them."""
         self._sent: Sent | None = None
@@ -213,7 +215,8 @@ class Teller:
         unheard = self._is_stuck() or (self._listeners is not None and not self._listeners)
         if unheard or 0 <= now - self._broken_at < _AGAIN_S or not self._may(now):
             return False
-        tells_them = self._own.at >= self._strangers_at and now - self._own.at <= self._watch.patience_s
+        spoke_at = min(self._own.at, self._spoke_at)  # what was written may have been lost since
+        tells_them = spoke_at >= self._strangers_at and now - spoke_at <= self._watch.patience_s
         if not tells_them and (now - self._strangers_at < _CONNECTS_S or self._misses_some()):
             self._failed(now)  # perhaps the other one did not reach them: they know nothing, or have stopped
         if not stopped and self._waits(now):
@@ -240,7 +243,7 @@ class Teller:
             self._broken_at = now
             raise
         self._watch.wrote(velocity, now)
-        self._reached = self._hearers
+        self._reached, self._spoke_at = self._hearers, now
         self._written.append(self._watch.told)
         self._left_at = self._heard_at if self._sent else now
         self._put(self._watch.told)

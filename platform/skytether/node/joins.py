@@ -14,6 +14,7 @@ import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
+from itertools import chain, repeat
 from typing import Self, TypeVar
 
 from . import shims
@@ -30,11 +31,16 @@ _TRY_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused, or ended."""
 _LOOK_S = 0.02
 """Between looks whether the one whose network is joined has ended."""
+_LONG_S, _PATIENCE_S = 10.0, 3.0
+"""How long a start usually takes at most, and an engine to say what a container is."""
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
 _ENDS = "the container whose network it joins is being ended"
-_HAS_ENDED = "the container whose network it joins has ended, as far as the kernel shows it (/proc, /sys/fs/cgroup)"
+_HAS_ENDED = (
+    "the container whose network it joins has ended, or cannot be kept as it is now, as far as the kernel shows it "
+    "(/proc, /sys/fs/cgroup)"
+)
 _ENDED = "the container whose network it joined ended meanwhile: it was ended, too"
 
 
@@ -133,16 +139,21 @@ class Joins:
                         raise BusyError(_HAS_ENDED)
                     self._note(held)
                     starts = begun(ask_long(self._engine, path, method="POST"))
-                    while not starts.done():
-                        await asyncio.wait((starts,), timeout=_LOOK_S)
-                        if life.has_ended():
-                            await self._kill(container)  # the engine does it as soon as it has started it
+                    long = begun(self._let_end(joined))
+                    try:
+                        while not starts.done():
+                            await asyncio.wait((starts,), timeout=_LOOK_S)
+                            if life.has_ended():
+                                await self._kill(container)  # the engine does it as soon as it has started it
+                    finally:
+                        long.cancel()
                     if not await life.goes_on():
                         await self.end_joined(container)
                         return conflict(_ENDED)
                     return starts.result()
-                except asyncio.CancelledError:
-                    ends = True  # this program does, and the engine goes on with that start: the next lets both go on
+                except BaseException as error:
+                    # If this program does, the engine goes on with that start, and the next program lets both go on.
+                    ends = not isinstance(error, Exception)
                     raise
                 finally:
                     if not ends and (paused is None or paused.status < HTTPStatus.BAD_REQUEST):
@@ -180,14 +191,32 @@ class Joins:
                 "who joins a network whose container ends in that moment may be in this machine's until it is ended"
             )
 
+    async def _let_end(self, container: str) -> None:
+        """See to it that a start ends which waits for what somebody else asked of the one whose network is joined."""
+        while True:
+            await asyncio.sleep(_LONG_S)
+            await self.let_end(container)
+
+    async def let_end(self, container: str) -> None:
+        """Let the engine end a container, if it waits for that: with what it asks the shim, it says nothing of it."""
+        if await state_of(self._engine, container, patience=_PATIENCE_S) is None:
+            with contextlib.suppress(OSError):
+                await asyncio.to_thread(shims.resume, container)
+
     async def _go_on(self, container: str) -> None:
-        for wait_s in _TRY_S:
+        refused = 0
+        for wait_s in chain(_TRY_S, repeat(_TRY_S[-1])):
             await asyncio.sleep(wait_s)
-            with contextlib.suppress(OSError, ValueError):
-                await asyncio.to_thread(shims.let_go_on, container)  # nobody has a container go on without it
+            try:
+                await asyncio.to_thread(shims.resume, container)  # nobody has a container go on without it
                 answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
-                if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
-                    return
+            except (OSError, ValueError):
+                continue  # it will be back, perhaps with all that ran
+            if answer.status < HTTPStatus.INTERNAL_SERVER_ERROR or b"not paused" in answer.content:
+                return
+            refused += 1
+            if refused == len(_TRY_S):
+                break
         log.error("container %s stays paused: docker unpause %s", container, container)
 
     async def let_go_on(self, container: str, joining: Callable[[], Awaitable[None]]) -> None:

@@ -320,6 +320,7 @@ class Removals:
             while await self._runs(one) is False and time.monotonic() < self._quiet_from:
                 await asyncio.sleep(_IDLE_S)
             while not await self._is_told_of(one):
+                await self._joins.let_end(container)
                 await asyncio.sleep(_SETTLED_S)
             if one in idle and await self._runs(one) and not await life.goes_on():
                 await self._joins.end_joined(one)

@@ -14,13 +14,15 @@ from pathlib import Path
 
 PROC = Path("/proc")
 _NAME = "containerd-shim"
+_LONGEST = 4096
+"""Bytes of a command line: of a process that sees to that it is as long as its memory."""
 _ENDED = "ZX"
 _STOPS_S = 0.2
 """For the kernel to stop all its threads."""
 
 
 def stop(container: str, first: object, proc: Path = PROC) -> bool | None:
-    """Stop that of a container that runs. `let_go_on` comes next, whatever this says.
+    """Stop that of a container that runs. `resume` comes next, whatever this says.
 
     Args:
         container: Its id.
@@ -28,17 +30,19 @@ def stop(container: str, first: object, proc: Path = PROC) -> bool | None:
         proc: Where the kernel shows processes.
 
     Returns:
-        Whether that number is this container's until then: not if it has ended. None: nobody can see to that, for
-        processes are hidden from this one, or the engine has no such process, or it is another user's.
+        Whether that number is this container's until then: not if it has ended, or if all that takes too long. None:
+        nobody can see to that, for processes are hidden from this one, or the engine has no such process, or it is
+        another user's.
     """
-    if not (proc / "1" / "stat").exists():
-        return None
     try:
+        if not (proc / "1" / "stat").exists():
+            return None
         if not _is_first(container, proc / str(first)):
             return False
         shim = int(_stat(proc / str(first))[1])
-        if not _signal(shim, container, signal.SIGSTOP, proc):
+        if not _is_shim(proc / str(shim), container):
             return None
+        os.kill(shim, signal.SIGSTOP)
         # Who is in its group is the container's own: so that number was, too, when it was asked whose child it is.
         return (
             _has_stopped(proc / str(shim))
@@ -51,31 +55,22 @@ def stop(container: str, first: object, proc: Path = PROC) -> bool | None:
         return False
 
 
-def let_go_on(container: str, proc: Path = PROC) -> None:
-    """What `stop` did is undone, whatever program did it. May be called again."""
+def resume(container: str, proc: Path = PROC) -> None:
+    """What `stop` did is undone, whatever program did it. May be called again.
+
+    Raises:
+        OSError: It cannot be found out now, for want of open files, say.
+    """
     for folder in proc.iterdir():
         if folder.name.isdecimal():
-            with contextlib.suppress(OSError):
-                _signal(int(folder.name), container, signal.SIGCONT, proc)
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError, PermissionError):
+                if _is_shim(folder, container):
+                    os.kill(int(folder.name), signal.SIGCONT)
 
 
-def _signal(process: int, container: str, number: signal.Signals, proc: Path) -> bool:
-    """Whether it is the shim of that container, and was sent that."""
-    words = (proc / str(process) / "cmdline").read_bytes().split(b"\0")
-    if not _is_shim(words, container):
-        return False
-    handle = os.pidfd_open(process)
-    try:
-        words = (proc / str(process) / "cmdline").read_bytes().split(b"\0")
-        if not _is_shim(words, container):  # another one has that number now
-            return False
-        signal.pidfd_send_signal(handle, number)
-    finally:
-        os.close(handle)
-    return True
-
-
-def _is_shim(words: list[bytes], container: str) -> bool:
+def _is_shim(folder: Path, container: str) -> bool:
+    with (folder / "cmdline").open("rb") as file:
+        words = file.read(_LONGEST).split(b"\0")
     return Path(os.fsdecode(words[0])).name.startswith(_NAME) and container.encode() in words
 
 
@@ -87,11 +82,18 @@ def _is_first(container: str, folder: Path) -> bool:
 def _has_stopped(folder: Path) -> bool:
     """Whether each of its threads has."""
     until = time.monotonic() + _STOPS_S
-    while any(_stat(thread)[0] != "T" for thread in (folder / "task").iterdir()):
+    while not all(map(_is_still, (folder / "task").iterdir())):
         if time.monotonic() > until:
             return False
         time.sleep(0.001)
     return True
+
+
+def _is_still(thread: Path) -> bool:
+    try:
+        return _stat(thread)[0] == "T"
+    except (FileNotFoundError, ProcessLookupError):  # it has ended
+        return True
 
 
 def _stat(folder: Path) -> list[str]:

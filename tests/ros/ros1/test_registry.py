@@ -99,6 +99,9 @@ def test_what_is_missed_is_told_the_master_again(master, registry):
     assert master.told == ["+a", "+b", "+a"]
     b.nonsense = True
     registry.step()
+    assert not registry.present
+    b.nonsense = False
+    registry.step()
     assert registry.present
 
 

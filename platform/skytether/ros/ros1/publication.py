@@ -281,8 +281,10 @@ class Publication:
                 pass
         finally:
             self._subscribers.remove(subscriber)
-            if caller not in self.subscribers and len(self._missed) < _MAX_SUBSCRIBERS:
+            if caller not in self.subscribers:
                 self._missed[caller] = (0, self._clock() + _MISSED_S)
+                while len(self._missed) > _MAX_SUBSCRIBERS:
+                    self._missed.pop(next(iter(self._missed)), None)
             self._is_anybody_back()
             subscriber.close()
 
@@ -304,14 +306,17 @@ class Publication:
             wanted: Names of the nodes that want it, as the master knows them; one that crashed is among them.
         """
         now = self._clock()
-        due = {name: tried for name, (tried, at) in list(self._missed.items()) if at <= now}
-        known = wanted() if due else ()
-        for name, tried in due.items():
-            if name not in known or tried >= _MOST_MISSED:
-                self._missed.pop(name, None)
-            elif name in self._missed:
+        due = [name for name, (_, at) in list(self._missed.items()) if at <= now]
+        for name in due:
+            tried, _ = self._missed.pop(name, (_MOST_MISSED, now))
+            if tried < _MOST_MISSED and name not in self.subscribers:
                 self._missed[name] = (tried + 1, now + _MISSED_S * 2 ** (tried + 1))
-        return any(name in self._missed for name in due)
+        left = [name for name in due if name in self._missed]
+        known = wanted() if left else ()
+        for name in left:
+            if name not in known:
+                self._missed.pop(name, None)
+        return not set(left).isdisjoint(known)
 
     def _is_anybody_back(self) -> bool:
         there = {each: each.caller for each in self._subscribers}

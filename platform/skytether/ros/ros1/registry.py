@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import suppress
+from functools import partial
 from typing import Protocol
 
 from .master import Master, MasterError, NonsenseError, RefusedError
@@ -136,9 +136,7 @@ class Registry:
             if self._call_master(entry.register, entry.name, wrong):
                 self._done.append(entry)
         for entry in () if self._held else self._done:
-            with suppress(NonsenseError):
-                if entry.is_missed(self._master):
-                    self._call_master(entry.register, entry.name, wrong)
+            self._call_master(partial(_register_if_missed, entry), entry.name, wrong)
         return wrong
 
     def _call_master(self, tell: Callable[[Master], None], name: str, wrong: dict[str, NonsenseError]) -> bool:
@@ -172,3 +170,8 @@ class Registry:
         if about not in self._said:
             _log.warning("%s", sentence)
         self._said.add(about)
+
+
+def _register_if_missed(entry: Entry, master: Master) -> None:
+    if entry.is_missed(master):
+        entry.register(master)
