@@ -129,7 +129,7 @@ def test_what_an_earlier_program_stopped_goes_on(gated: Gated) -> None:
 def test_somebody_else_can_end_a_container_whose_network_is_joined(
     gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The engine waits for the shim then, which is stopped, and the start for which it is stopped waits for the engine."""
+    """The engine waits for the stopped shim then, and what that is stopped for waits for the engine."""
     gated.network()
     holds, _ = gated.make()
     joins, _ = gated.make(network=f"container:{holds}", starts=False)
