@@ -5,10 +5,11 @@ from __future__ import annotations
 import gc
 import logging
 import os
-import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -85,13 +86,13 @@ def _run(settings: RobotConfig, path: Path, token: str, seconds: float | None, r
     Raises:
         ConfigError: The graph cannot be joined as it is configured.
     """
-    ended = threading.Event()
+    ended: SimpleQueue[str] = SimpleQueue()  # an interrupt in the middle of `threading.Event.wait` is another error
 
     def end(reason: str) -> None:
         says = f"robot {settings.robot} ends: {reason or 'asked to by rosnode kill'}"
         _log.error("%s", says)
         console.print(says, markup=False, soft_wrap=True)
-        ended.set()
+        ended.put(reason)
 
     folder = path.parent
     with (
@@ -122,7 +123,7 @@ def _base(settings: RobotConfig, graph: RobotHardware) -> RobotHardware:
 
 def _watch(
     status: Callable[[], AgentStatus],
-    ended: threading.Event,
+    ended: SimpleQueue[str],
     seconds: float | None,
     gate: OwnGate | FoundGate | None,
     on_status: Callable[[AgentStatus], object],
@@ -146,7 +147,8 @@ def _watch(
         if now != before:
             console.print(now, markup=False, soft_wrap=True)
             before = now
-        if ended.wait(_STATUS_S):
+        with suppress(Empty):
+            ended.get(timeout=_STATUS_S)
             return
         trouble = gate.ensure_running() if gate is not None else ""
         if trouble:
