@@ -85,7 +85,9 @@ class OwnEngine:
             if containers:
                 self.docker("rm", "-f", *containers)
             self.kill()
-        for pid in _mentioning(f"{self.folder}/"):  # what would hold a container while there is no engine
+        # What would hold a container while there is no engine, and what was about to become one as it was killed: to a
+        # node of another test that is a container that goes on though it has ended.
+        for pid in {*_mentioning(f"{self.folder}/"), *_mentioning(f"{self.folder}/", "environ")}:
             os.kill(pid, signal.SIGKILL)
         mounts = [line.split()[1] for line in Path("/proc/mounts").read_text().splitlines()]
         for mount in reversed(mounts):
@@ -109,12 +111,12 @@ def _as_the_machines_own() -> list[str]:
     return [f"--default-runtime={name}", *([f"--add-runtime={name}={path}"] if path != name else [])]
 
 
-def _mentioning(text: str) -> list[int]:
-    """Processes with this in their command line."""
+def _mentioning(text: str, where: str = "cmdline") -> list[int]:
+    """Processes with this in their command line, or environment."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         try:
-            command = (process / "cmdline").read_bytes()
+            command = (process / where).read_bytes()
         except OSError:  # gone meanwhile
             continue
         if text.encode() in command:
