@@ -6,6 +6,7 @@ wheels' topic when the guard is gone. Who is connected stays so when the master 
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -28,6 +29,8 @@ from ..gate_io import WheelsTiming
 from ..inbox import Inbox, Topics
 from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, twist_of
 from .sections import Ros1Way
+
+_MOST_TWINS = 256
 
 
 class Ros1Wheels(RosWheels[Node]):
@@ -52,6 +55,7 @@ class Ros1Wheels(RosWheels[Node]):
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._heard: Heard | None = None
         self._names: list[str] = []
+        self._twins: set[str] = set()
         super().__init__(_start(way, role))
         if place:
             place.keep()
@@ -104,8 +108,10 @@ class Ros1Wheels(RosWheels[Node]):
         return frozenset(f"{name} {self._renewed}" for name in self._names)
 
     def hearers(self) -> frozenset[str]:
-        """Wheels: these nodes, each as often as it is connected."""
-        return frozenset(f"{name} {number}" for name, count in Counter(self._names).items() for number in range(count))
+        """Wheels: these nodes; of a name that was ever there twice, nobody knows whether the other one has the same."""
+        if len(self._names) > len(set(self._names)) and len(self._twins) < _MOST_TWINS:
+            self._twins |= {name for name, count in Counter(self._names).items() if count > 1}
+        return frozenset(f"{name} {os.getpid()}" if name in self._twins else name for name in self._names)
 
 
 class Ros1Sensors(RosSensors[Node]):
