@@ -131,26 +131,7 @@ class Joins:
                     paused = await ask_long(self._engine, f"/containers/{joined}/pause", method="POST")
                     if paused.status >= HTTPStatus.BAD_REQUEST:
                         return paused  # it has ended, or is about to, or somebody else has it paused
-                    life = await Life(self._engine, joined).begin()
-                    if not life.is_known():
-                        raise BusyError("its engine says nothing of the container whose network it joins")
-                    held = shims.stop(joined, life.first())  # in no thread: that would go on when this has ended
-                    if held is False or life.has_ended():
-                        raise BusyError(_HAS_ENDED)
-                    self._note(held)
-                    starts = begun(ask_long(self._engine, path, method="POST"))
-                    long = begun(self._let_end(joined))
-                    try:
-                        while not starts.done():
-                            await asyncio.wait((starts,), timeout=_LOOK_S)
-                            if life.has_ended():
-                                await self._kill(container)  # the engine does it as soon as it has started it
-                    finally:
-                        long.cancel()
-                    if not await life.goes_on():
-                        await self.end_joined(container)
-                        return conflict(_ENDED)
-                    return starts.result()
+                    return await self._start_beside(container, path, joined)
                 except BaseException as error:
                     # If this program does, the engine goes on with that start, and the next program lets both go on.
                     ends = not isinstance(error, Exception)
@@ -160,6 +141,29 @@ class Joins:
                         await self._go_on(joined)
         finally:
             self._has_joined(joined)
+
+    async def _start_beside(self, container: str, path: str, joined: str) -> Answer:
+        """With that one paused."""
+        life = await Life(self._engine, joined).begin()
+        if not life.is_known():
+            raise BusyError("its engine says nothing of the container whose network it joins")
+        held = shims.stop(joined, life.first())  # in no thread: that would go on when this has ended
+        if held is False or life.has_ended():
+            raise BusyError(_HAS_ENDED)
+        self._note(held)
+        starts = begun(ask_long(self._engine, path, method="POST"))
+        long = begun(self._let_end(joined))
+        try:
+            while not starts.done():
+                await asyncio.wait((starts,), timeout=_LOOK_S)
+                if life.has_ended():
+                    await self._kill(container)  # the engine does it as soon as it has started it
+        finally:
+            long.cancel()
+        if not await life.goes_on():
+            await self.end_joined(container)
+            return conflict(_ENDED)
+        return starts.result()
 
     def _has_joined(self, joined: str) -> None:
         self._joined[joined] -= 1
