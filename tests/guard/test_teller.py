@@ -281,12 +281,8 @@ def test_who_takes_over_goes_on_where_the_other_one_has_told_who_came(both, soon
     assert second.wheels.told[-1].linear == pytest.approx(0.0 if soon else 0.3 - 2.0 * 0.051)
 
 
-@pytest.mark.parametrize("soon", [True, False])
-def test_who_came_just_now_may_have_stopped_while_the_other_one_told_others(both, soon):
-    """The gate did not reach the wheels yet, and braked for a recorder while the writer stood still for 0.16 s."""
-    first, second = both
-    first.wheels.nodes = frozenset({"/base again"})
-    first.turn(0.5 if soon else -9.0, FAST)
+def first_word_after_a_freeze(first, second):
+    """Of the first, which stood still for 0.16 s while the second braked."""
     for i in range(20):
         first.turn(1.0 + i * PERIOD, FAST)
     for i in range(1, 9):
@@ -295,7 +291,16 @@ def test_who_came_just_now_may_have_stopped_while_the_other_one_told_others(both
     turn, before = 1.38 + 8 * PERIOD, len(first.wheels.told)
     while len(first.wheels.told) == before:
         first.turn(turn := turn + PERIOD, FAST)
-    assert (first.wheels.told[-1] == STANDSTILL) == soon
+    return first.wheels.told[-1]
+
+
+@pytest.mark.parametrize("soon", [True, False])
+def test_who_came_just_now_may_have_stopped_while_the_other_one_told_others(both, soon):
+    """The gate did not reach the wheels yet, and braked for a recorder while the writer stood still for 0.16 s."""
+    first, second = both
+    first.wheels.nodes = frozenset({"/base again"})
+    first.turn(0.5 if soon else -9.0, FAST)
+    assert (first_word_after_a_freeze(first, second) == STANDSTILL) == soon
 
 
 @pytest.mark.parametrize("reached", [True, False])
@@ -306,15 +311,7 @@ def test_whom_the_other_one_did_not_reach_hears_a_standstill_first(both, reached
     second.wheels.nodes = second.wheels.names = first.wheels.names if reached else frozenset({"/recorder"})
     for one in (first, second):
         one.turn(-9.0)
-    for i in range(20):
-        first.turn(1.0 + i * PERIOD, FAST)
-    for i in range(1, 9):
-        second.turn(1.385 + i * PERIOD)
-    assert second.wheels.told[-1].linear > 0
-    turn, before = 1.38 + 8 * PERIOD, len(first.wheels.told)
-    while len(first.wheels.told) == before:
-        first.turn(turn := turn + PERIOD, FAST)
-    assert (first.wheels.told[-1] == STANDSTILL) is not reached
+    assert (first_word_after_a_freeze(first, second) == STANDSTILL) is not reached
 
 
 @pytest.mark.parametrize("reached", [True, False])

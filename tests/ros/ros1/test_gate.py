@@ -1,8 +1,11 @@
 """The gate as nodes of a real ROS 1 graph, with a real agent, bridge and service beside it that are killed."""
 
+import socket
 import subprocess
 import time
+from contextlib import closing
 from itertools import pairwise
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from skytether.robot.graphs.ros1.kind import Ros1Way
 from skytether.robot.safety.client import GateError, ask
 from skytether.ros.ros1.node import Node
 from skytether.ros.ros1.subscription import Listener
+from skytether.ros.ros1.tcpros import pack_header
 
 pytestmark = [pytest.mark.ros1, pytest.mark.slow]
 
@@ -160,3 +164,28 @@ def test_a_gate_alone_names_who_else_publishes_the_wheels_topic(graph, gated, wa
     wait_for(named, "the other publisher is named")
     other.terminate()
     wait_for(lambda: not named(), "it is gone")
+
+
+def test_of_a_name_that_was_there_twice_nobody_knows_whether_the_other_one_has_the_same(graph, monkeypatch):
+    """An old node of the wheels' name was left with one of gate and writer, and stood for the new one at the other."""
+    nodes, start = [], Node.start
+    monkeypatch.setattr(Node, "start", lambda node: (nodes.append(node), start(node)))
+    wheels = Ros1Wheels(Ros1Way(master=graph.uri, cmd_vel="/told"), "guard", WheelsTiming(0.1, 0.1, 0.1, 1.0))
+    address = urlsplit(nodes[0].rosrpc)
+
+    def hearers(count):
+        wait_for(lambda: len(nodes[0].connections()) == count, "the connections")
+        wheels.listeners()
+        return wheels.hearers()
+
+    def connect():
+        connection = socket.create_connection((address.hostname, address.port))
+        connection.sendall(pack_header({"callerid": "/base", "topic": "/told", "type": "*", "md5sum": "*"}))
+        return connection
+
+    with closing(wheels), connect():
+        assert hearers(1) == {"/base"}
+        with connect():
+            assert "/base" not in hearers(2)
+        assert "/base" not in hearers(1), "which of both has left?"
+        assert len(hearers(1)) == 1

@@ -31,6 +31,7 @@ from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, 
 from .sections import Ros1Way
 
 _MOST_TWINS = 256
+"""Names that are remembered: somebody may make them up."""
 
 
 class Ros1Wheels(RosWheels[Node]):
@@ -55,7 +56,9 @@ class Ros1Wheels(RosWheels[Node]):
         self._patience_s = timing.guard_s if way.need_acknowledgements else inf
         self._heard: Heard | None = None
         self._names: list[str] = []
+        """Of the connections at the last look."""
         self._twins: set[str] = set()
+        """Names that two of these had at a time."""
         super().__init__(_start(way, role))
         if place:
             place.keep()
@@ -109,7 +112,7 @@ class Ros1Wheels(RosWheels[Node]):
 
     def hearers(self) -> frozenset[str]:
         """Wheels: these nodes; of a name that was ever there twice, nobody knows whether the other one has the same."""
-        if len(self._names) > len(set(self._names)) and len(self._twins) < _MOST_TWINS:
+        if len(self._twins) < _MOST_TWINS:
             self._twins |= {name for name, count in Counter(self._names).items() if count > 1}
         return frozenset(f"{name} {os.getpid()}" if name in self._twins else name for name in self._names)
 
