@@ -2,6 +2,8 @@
 
 import errno
 import os
+import signal
+import subprocess
 
 import pytest
 
@@ -74,3 +76,14 @@ def test_what_cannot_be_listed_is_not_taken_for_ended(root, monkeypatch):
 
 def test_it_says_what_ends_them(root):
     assert Cgroups(root).kill(ONE) == f"kill -9 $(cat {root}/pids/docker/{ONE}/cgroup.procs)"
+
+
+def test_processes_of_one_are_ended(root):
+    with subprocess.Popen(["sleep", "60"]) as one, subprocess.Popen(["sleep", "60"]) as other:
+        # 0: it is of a computer that this one is within, and would be this program's own group
+        (root / "pids" / "docker" / ONE / "cgroup.procs").write_text(f"0\n{one.pid}\n")
+        Cgroups(root).end(ONE)
+        Cgroups(root).end("5" * 64)
+        assert one.wait(10) == -signal.SIGKILL
+        assert other.poll() is None
+        other.kill()

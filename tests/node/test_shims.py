@@ -105,3 +105,9 @@ def test_what_does_not_stop_holds_nothing(proc, monkeypatch):
     monkeypatch.setattr(shims, "_STOPS_S", 0.0)
     monkeypatch.setattr(os, "kill", lambda *_: None)
     assert shims.stop(ONE, FIRST, proc) is False
+
+
+def test_whether_one_of_several_has_one(proc, beside):
+    assert shims.is_any((OTHER, ONE), proc)
+    assert not shims.is_any((OTHER,), proc)
+    assert not shims.is_any((), proc)

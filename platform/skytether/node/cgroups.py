@@ -6,8 +6,10 @@ and with them whatever folders they have open, though an engine says that nothin
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import signal
 from pathlib import Path
 
 ROOT = Path("/sys/fs/cgroup")
@@ -41,6 +43,15 @@ class Cgroups:
         """The command that ends its processes."""
         groups = " ".join(f"{folder}/cgroup.procs" for folder in self._folders.get(container, {}))
         return f"kill -9 $(cat {groups})"
+
+    def end(self, container: str) -> None:
+        """End its processes, those that this user's program may; may be called again."""
+        for folder in self._folders.get(container, {}):
+            with contextlib.suppress(OSError):
+                for line in (folder / "cgroup.procs").read_text().split():
+                    if (number := int(line)) > 0:  # 0: it is of a computer that this one is within
+                        with contextlib.suppress(ProcessLookupError, PermissionError):
+                            os.kill(number, signal.SIGKILL)
 
     def of_docker(self) -> set[str]:
         """Containers that an engine of Docker made, or may have."""

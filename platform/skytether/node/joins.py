@@ -3,7 +3,7 @@
 An engine names that network by the number of a process. If that ended before runc looks, another process could have its
 number: one of the machine, whose network the container would be in. Where the memory of the machine is used up, the
 kernel ends what is paused, too: so nobody else gets that number meanwhile (`shims`). Where that cannot be seen to, who
-joined is ended at once.
+joins is ended as soon as it has a process.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection, Iterable
 from http import HTTPStatus
 from itertools import chain, repeat
 from typing import Self, TypeVar
@@ -33,6 +33,8 @@ _LOOK_S = 0.02
 """Between looks whether the one whose network is joined has ended."""
 _LONG_S, _PATIENCE_S = 10.0, 3.0
 """How long a start usually takes at most, and an engine to say what a container is."""
+_MOST_SILENT = 3
+"""Times that it says nothing, one after the other, until it is sure that it does not just take its time."""
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
@@ -42,6 +44,17 @@ _HAS_ENDED = (
     "(/proc, /sys/fs/cgroup)"
 )
 _ENDED = "the container whose network it joined ended meanwhile: it was ended, too"
+
+
+def _end_processes(containers: Iterable[str]) -> list[str]:
+    """Those that have some."""
+    with contextlib.suppress(OSError):
+        cgroups = Cgroups()
+        found = [one for one in containers if cgroups.go_on(one)]
+        for one in found:
+            cgroups.end(one)
+        return found
+    return []
 
 
 class BusyError(Exception):
@@ -152,14 +165,11 @@ class Joins:
             raise BusyError(_HAS_ENDED)
         self._note(held)
         starts = begun(ask_long(self._engine, path, method="POST"))
-        long = begun(self._let_end(joined))
+        seeing = begun(self.see_to(joined, (container,), life))
         try:
-            while not starts.done():
-                await asyncio.wait((starts,), timeout=_LOOK_S)
-                if life.has_ended():
-                    await self._kill(container)  # the engine does it as soon as it has started it
+            await asyncio.wait((starts,))
         finally:
-            long.cancel()
+            seeing.cancel()
         if not await life.goes_on():
             await self.end_joined(container)
             return conflict(_ENDED)
@@ -195,17 +205,43 @@ class Joins:
                 "who joins a network whose container ends in that moment may be in this machine's until it is ended"
             )
 
-    async def _let_end(self, container: str) -> None:
-        """See to it that a start ends which waits for what somebody else asked of the one whose network is joined."""
+    async def see_to(self, joined: str, joining: Collection[str], life: Life) -> None:
+        """What is to be done while an engine may start some that join a container's network; until it is cancelled.
+
+        Args:
+            joined: That container.
+            joining: Those that it may start, and that do not run yet.
+            life: Of that container, since before their starts.
+        """
+        letting = begun(self._let_end(joined, joining))
+        killing: dict[str, asyncio.Task[bool]] = {}
+        went_on = not life.has_ended()
+        try:
+            while True:
+                await asyncio.sleep(_LOOK_S)
+                if went_on and life.has_ended():
+                    for one in await asyncio.to_thread(_end_processes, joining):  # mostly before its program is there
+                        if one not in killing or killing[one].done():  # its engine does it when it has started it
+                            killing[one] = begun(self._kill(one))
+        finally:
+            letting.cancel()
+
+    async def _let_end(self, joined: str, joining: Collection[str]) -> None:
+        """See to it that an engine ends a container, where somebody else asked it to.
+
+        It waits for the shim then, and says nothing of that container; a start that has to ask for it waits, too. Once
+        a start goes on without that, the number stays taken until it has ended, and it is not let take much longer.
+        """
+        silent = 0
         while True:
             await asyncio.sleep(_LONG_S)
-            await self.let_end(container)
-
-    async def let_end(self, container: str) -> None:
-        """Let the engine end a container, if it waits for that: with what it asks the shim, it says nothing of it."""
-        if await state_of(self._engine, container, patience=_PATIENCE_S) is None:
+            said = await state_of(self._engine, joined, patience=_PATIENCE_S)
+            silent = silent + 1 if said is None else 0
             with contextlib.suppress(OSError):
-                await asyncio.to_thread(shims.resume, container)
+                if silent and not await asyncio.to_thread(shims.is_any, joining):
+                    await asyncio.to_thread(shims.resume, joined)
+                elif silent >= _MOST_SILENT:
+                    await asyncio.to_thread(_end_processes, joining)
 
     async def _go_on(self, container: str) -> None:
         refused = 0

@@ -316,14 +316,17 @@ class Removals:
         """
         life = await Life(self._engine, container).begin()
         idle = {one for one in joining if not await self._is_said_to_run(one)}  # a start of theirs may be under way
-        for one in joining:
-            while await self._runs(one) is False and time.monotonic() < self._quiet_from:
-                await asyncio.sleep(_IDLE_S)
-            while not await self._is_told_of(one):
-                await self._joins.let_end(container)
-                await asyncio.sleep(_SETTLED_S)
-            if one in idle and await self._runs(one) and not await life.goes_on():
-                await self._joins.end_joined(one)
+        seeing = begun(self._joins.see_to(container, idle, life))
+        try:
+            for one in joining:
+                while await self._runs(one) is False and time.monotonic() < self._quiet_from:
+                    await asyncio.sleep(_IDLE_S)
+                while not await self._is_told_of(one):
+                    await asyncio.sleep(_SETTLED_S)
+                if one in idle and await self._runs(one) and not await life.goes_on():
+                    await self._joins.end_joined(one)
+        finally:
+            seeing.cancel()
 
     async def _look_again(self) -> None:
         """When all has begun that an earlier program asked for: it may have paused one after the list was told."""

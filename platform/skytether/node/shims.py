@@ -10,6 +10,7 @@ import contextlib
 import os
 import signal
 import time
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 PROC = Path("/proc")
@@ -61,17 +62,34 @@ def resume(container: str, proc: Path = PROC) -> None:
     Raises:
         OSError: It cannot be found out now, for want of open files, say.
     """
+    for number in _shims_of((container,), proc):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.kill(number, signal.SIGCONT)
+
+
+def is_any(containers: Collection[str], proc: Path = PROC) -> bool:
+    """Whether one of these has that process: from then on its engine asks nothing more of another to start it.
+
+    Raises:
+        OSError: As `resume`.
+    """
+    return any(_shims_of(containers, proc))
+
+
+def _shims_of(containers: Collection[str], proc: Path) -> Iterator[int]:
     for folder in proc.iterdir():
         if folder.name.isdecimal():
             with contextlib.suppress(FileNotFoundError, ProcessLookupError, PermissionError):
-                if _is_shim(folder, container):
-                    os.kill(int(folder.name), signal.SIGCONT)
+                if _is_shim(folder, *containers):
+                    yield int(folder.name)
 
 
-def _is_shim(folder: Path, container: str) -> bool:
+def _is_shim(folder: Path, *containers: str) -> bool:
+    """Whether that process is of one of these containers."""
     with (folder / "cmdline").open("rb") as file:
         words = file.read(_LONGEST).split(b"\0")
-    return Path(os.fsdecode(words[0])).name.startswith(_NAME) and container.encode() in words
+    named = Path(os.fsdecode(words[0])).name.startswith(_NAME)
+    return named and any(container.encode() in words for container in containers)
 
 
 def _is_first(container: str, folder: Path) -> bool:
