@@ -1,7 +1,9 @@
 """The node among real masters and real nodes of ROS 1."""
 
+import socket
 import subprocess
 import threading
+from contextlib import ExitStack
 
 import pytest
 from ros1_graph import wait_for
@@ -132,6 +134,21 @@ def test_a_node_of_rospy_whose_connection_is_reset_comes_back(graph, node):
         assert listener.stdout.readline().decode() == f"{word}\n"
         node.soon(ours.close)
         wait_for(lambda: ours.subscribers == [], "the end of its connection")
+
+
+def test_connections_that_say_nothing_keep_nobody_out(graph):
+    """The gate's took all its file descriptors: its robot crept, and nobody was told how it was."""
+    with Node("skytether", graph.uri, connections=4) as node, ExitStack() as stack:
+        ours = node.advertise("/ours", STRING, MD5)
+        address = node.offered("/ours")
+        silent = [stack.enter_context(socket.create_connection(address)) for _ in range(9)]
+        assert [sock.recv(1) for sock in silent[:5]] == [b""] * 5, "the oldest have gone"
+        listener = graph.python(LISTENER, "listener", "/ours", stdout=subprocess.PIPE)
+        wait_for(lambda: ours.subscribers == ["/listener"], "the listener")
+        for _ in range(9):
+            stack.enter_context(socket.create_connection(address))
+        ours.publish(encode(String("on"), "ros1"))
+        assert listener.stdout.readline() == b"on\n"
 
 
 def test_another_type_is_refused_on_both_sides_with_both_sums_named_once(graph, node, caplog):

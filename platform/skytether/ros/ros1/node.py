@@ -40,7 +40,8 @@ _HEADER_S = 10.0
 """For a connection to say what it is for."""
 _WORKERS = 16
 """Requests to other nodes, and service calls, at the same time."""
-_MAX_CONNECTIONS = 1024
+CONNECTIONS = 1024
+"""That a node has from others at a time: each takes a file descriptor."""
 
 
 class NodeError(Exception):
@@ -123,6 +124,7 @@ class Node:
         on_end: Called in a thread of its own if the master or a person wants the node to end. None: it goes on, and
             keeps its name against others that register by it.
         look_s: Between looks at the master.
+        connections: That it has from others at a time. If more come, the oldest goes that has not said what it is for.
     """
 
     def __init__(
@@ -133,6 +135,7 @@ class Node:
         host: str | None = None,
         on_end: Callable[[str], None] | None = None,
         look_s: float = LOOK_S,
+        connections: int = CONNECTIONS,
     ) -> None:
         self.name = resolve(name, "/")
         self.master_uri = master_uri
@@ -147,6 +150,9 @@ class Node:
         self._publications: dict[str, _Published] = {}
         self._services: dict[str, _Served] = {}
         self._connections: set[asyncio.Task[None]] = set()
+        self._silent: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        """Of these, in the order in which they came, those that have not said what they are for."""
+        self._most_connections = connections
         self._loop = asyncio.new_event_loop()
         self._workers = concurrent.futures.ThreadPoolExecutor(_WORKERS, thread_name_prefix="ros1-ask")
         self._thread: threading.Thread | None = None
@@ -389,12 +395,24 @@ class Node:
         return self._loop.run_in_executor(self._workers, function)
 
     def _on_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._connections) >= _MAX_CONNECTIONS:
-            writer.close()
-            return
+        if len(self._connections) >= self._most_connections:
+            if not self._silent:
+                writer.close()
+                return
+            self._end_oldest()
         task = self._loop.create_task(self._guarded(self._serve(reader, writer), writer))
         self._connections.add(task)
-        task.add_done_callback(self._connections.discard)
+        self._silent[task] = writer
+        task.add_done_callback(self._forget)
+
+    def _end_oldest(self) -> None:
+        connection, writer = next(iter(self._silent.items()))
+        writer.close()  # it ends by that
+        self._forget(connection)
+
+    def _forget(self, connection: asyncio.Task[None]) -> None:
+        self._connections.discard(connection)
+        self._silent.pop(connection, None)
 
     async def _guarded(self, work: Coroutine[Any, Any, None], writer: asyncio.StreamWriter) -> None:
         try:
@@ -408,6 +426,8 @@ class Node:
         tune(writer)
         async with asyncio.timeout(_HEADER_S):
             header = await read_header(reader)
+        if (own := asyncio.current_task()) is not None:
+            self._silent.pop(own, None)
         with self._lock:
             service = self._services.get(header.get("service", ""))
             published = self._publications.get(header.get("topic", ""))

@@ -30,6 +30,8 @@ from ..inbox import Inbox, Topics
 from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, twist_of
 from .sections import Ros1Way
 
+_CONNECTIONS = 192
+"""Of one node: a process of the gate has two, and 1,024 file descriptors."""
 _MOST_TWINS = 256
 """Names that are remembered: somebody may make them up."""
 
@@ -161,7 +163,7 @@ class Ros1Display(RosGateNode[Node]):
 
 
 def _start(way: Ros1Way, role: str) -> Node:
-    node = Node(resolve(f"{way.node}_{role}", way.namespace), way.master, host=way.host)
+    node = Node(resolve(f"{way.node}_{role}", way.namespace), way.master, host=way.host, connections=_CONNECTIONS)
     try:
         node.start()
     except NodeError as error:
