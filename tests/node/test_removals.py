@@ -156,8 +156,11 @@ def test_somebody_else_can_end_a_container_whose_network_is_joined(
 def test_somebody_else_ends_it_only_when_who_joins_is_in_its_network_or_nowhere(
     gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That start takes long, and needs nothing more of the engine: its end gave another process the number before."""
-    monkeypatch.setattr("skytether.node.joins._LONG_S", 0.2)
+    """That start takes long, and needs nothing more of the engine: its end gave another process the number before.
+
+    For good nobody is kept waiting. Then who joins is ended as soon as it has a process.
+    """
+    monkeypatch.setattr("skytether.node.joins._LONG_S", 1.0)
     monkeypatch.setattr("skytether.node.joins._PATIENCE_S", 0.2)
     gated.network()
     holds, _ = gated.make()
@@ -170,13 +173,16 @@ def test_somebody_else_ends_it_only_when_who_joins_is_in_its_network_or_nowhere(
         os.kill(runtime, signal.SIGSTOP)
         after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
         ends = pool.submit(ask, ENGINE, f"/containers/{holds}/kill?signal=KILL", method="POST", patience=60)
-        time.sleep(3.0)  # several times what it waits for before it lets that one end
+        time.sleep(3.0)  # longer than it waits for before it lets that one end, were there no start under way
         assert Path(f"/proc/{number}").exists()
         assert not ends.done()
-        os.kill(runtime, signal.SIGCONT)
-        said.result(30)
         assert ends.result(30).status == HTTPStatus.NO_CONTENT
-    assert gated.ask(f"POST /containers/{holds}/wait").status == HTTPStatus.OK
+        while Path(f"/proc/{number}").exists():
+            time.sleep(0.01)
+        os.kill(runtime, signal.SIGCONT)
+        assert b"ended meanwhile" in said.result(30).content
+    state = json.loads(ask(ENGINE, f"/containers/{joins}/json").content)["State"]
+    assert state["Running"] is False
 
 
 def _runtime_of(container: str) -> int | None:

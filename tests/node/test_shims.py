@@ -111,3 +111,17 @@ def test_whether_one_of_several_has_one(proc, beside):
     assert shims.is_any((OTHER, ONE), proc)
     assert not shims.is_any((OTHER,), proc)
     assert not shims.is_any((), proc)
+
+
+def test_what_is_in_a_container_and_called_so_is_none(proc):
+    """It kept whoever asked for the end of another one waiting for good."""
+    (proc / "7").mkdir()
+    (proc / "7" / "cmdline").write_text(f"containerd-shim\0-id\0{OTHER}\0")
+    for numbers, is_one in (("7", True), ("7\t2", False)):
+        (proc / "7" / "status").write_text(f"Name:\tNSpid: 7\nNSpid:\t{numbers}\n")
+        (proc / "7" / "stat").write_text("7 (shim) S 1 4 4 0\n")
+        assert shims.is_any((OTHER,), proc) is is_one
+
+
+def test_one_beside_real_processes_is_found(proc, beside):
+    assert shims.is_any((ONE,), Path("/proc"))

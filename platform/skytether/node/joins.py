@@ -231,6 +231,7 @@ class Joins:
 
         It waits for the shim then, and says nothing of that container; a start that has to ask for it waits, too. Once
         a start goes on without that, the number stays taken until it has ended, and it is not let take much longer.
+        But whoever asked is not kept waiting for good.
         """
         silent = 0
         while True:
@@ -238,10 +239,10 @@ class Joins:
             said = await state_of(self._engine, joined, patience=_PATIENCE_S)
             silent = silent + 1 if said is None else 0
             with contextlib.suppress(OSError):
-                if silent and not await asyncio.to_thread(shims.is_any, joining):
-                    await asyncio.to_thread(shims.resume, joined)
-                elif silent >= _MOST_SILENT:
+                if silent >= _MOST_SILENT:
                     await asyncio.to_thread(_end_processes, joining)
+                if silent > _MOST_SILENT or (silent and not await asyncio.to_thread(shims.is_any, joining)):
+                    await asyncio.to_thread(shims.resume, joined)
 
     async def _go_on(self, container: str) -> None:
         refused = 0

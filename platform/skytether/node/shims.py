@@ -80,7 +80,7 @@ def _shims_of(containers: Collection[str], proc: Path) -> Iterator[int]:
     for folder in proc.iterdir():
         if folder.name.isdecimal():
             with contextlib.suppress(FileNotFoundError, ProcessLookupError, PermissionError):
-                if _is_shim(folder, *containers):
+                if _is_shim(folder, *containers) and _is_of_machine(folder):
                     yield int(folder.name)
 
 
@@ -90,6 +90,12 @@ def _is_shim(folder: Path, *containers: str) -> bool:
         words = file.read(_LONGEST).split(b"\0")
     named = Path(os.fsdecode(words[0])).name.startswith(_NAME)
     return named and any(container.encode() in words for container in containers)
+
+
+def _is_of_machine(folder: Path) -> bool:
+    """Whether it is in no container, where anybody can have it called as he likes: it has one number only, then."""
+    lines = (folder / "status").read_text(errors="replace").splitlines()
+    return any(len(line.split()) == 2 for line in lines if line.startswith("NSpid:"))
 
 
 def _is_first(container: str, folder: Path) -> bool:

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from skytether.ros.ros1 import slave
 from skytether.ros.ros1.slave import MasterHost, SlaveServer
 
 
@@ -70,9 +69,8 @@ def test_only_the_masters_machine_ends_a_node_or_changes_its_publishers() -> Non
         server.close()
 
 
-def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slave, "MOST_OF_ONE", 16)
-    server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
+def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out() -> None:
+    server = SlaveServer(Node(), "127.0.0.1", lambda address: False, most=32)
     threads = threading.active_count()
     held = []
     try:
@@ -96,9 +94,8 @@ def test_who_opens_connections_without_end_has_a_few_and_keeps_nobody_else_out(m
         server.close()
 
 
-def test_all_together_have_no_more_than_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(slave, "MOST_CONNECTIONS", 3)
-    server = SlaveServer(Node(), "127.0.0.1", lambda address: False)
+def test_all_together_have_no_more_than_there_is() -> None:
+    server = SlaveServer(Node(), "127.0.0.1", lambda address: False, most=3)
     try:
         held = [
             socket.create_connection(("127.0.0.1", server.port), 10, (f"127.0.0.{number}", 0)) for number in range(2, 6)

@@ -28,7 +28,7 @@ from .master import Master
 from .publication import QUEUE, Publication, Speaking
 from .registry import LOOK_S, Registry
 from .services import CallRefusedError, ServiceServer, ServiceType
-from .slave import SlaveServer
+from .slave import MOST_CONNECTIONS, SlaveServer
 from .subscription import Listener, Subscription, tune
 from .tcpros import HeaderError, pack_header, read_header
 
@@ -124,7 +124,8 @@ class Node:
         on_end: Called in a thread of its own if the master or a person wants the node to end. None: it goes on, and
             keeps its name against others that register by it.
         look_s: Between looks at the master.
-        connections: That it has from others at a time. If more come, the oldest goes that has not said what it is for.
+        connections: That it has from others at a time, and as many again, up to 256, for XML-RPC. If more come, the
+            oldest goes that has not said what it is for.
     """
 
     def __init__(
@@ -169,7 +170,7 @@ class Node:
         try:
             self._server = self._loop.run_until_complete(asyncio.start_server(self._on_connection, bind, 0))
             self._port = self._server.sockets[0].getsockname()[1]
-            self._api = SlaveServer(self, bind)
+            self._api = SlaveServer(self, bind, most=min(MOST_CONNECTIONS, self._most_connections))
         except OSError as error:
             self._loop.close()
             raise NodeError(f"cannot listen at {self._host}: {error.strerror or error}; set host, or ROS_IP") from error

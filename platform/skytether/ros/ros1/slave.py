@@ -21,9 +21,10 @@ FROM_MASTER = ("shutdown", "publisherUpdate")
 """What ends the node, or takes its topics to other publishers: only the machine of the master may, and this one."""
 _RESOLVED_S = 10.0
 """So long a name's addresses are good: others may make us look it up."""
-MOST_CONNECTIONS, MOST_OF_ONE = 256, 128
-"""Connections at a time, each of which has a thread: in all, and from one address, so that a stranger's do not keep the
-master out. All nodes of a machine may ask at once, when a topic that they want comes; each is answered and closed."""
+MOST_CONNECTIONS = 256
+"""Connections at a time, each of which has a thread; half as many from one address, so that a stranger's do not keep
+the master out. All nodes of a machine may ask at once, when a topic that they want comes; each is answered and closed.
+"""
 _IDLE_S = 30.0
 """A connection that says nothing for so long is closed."""
 
@@ -110,6 +111,7 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
     request_queue_size = MOST_CONNECTIONS
     """Who finds no room in it comes again after a second, by its kernel's timer."""
     trusts: Callable[[str], bool]
+    most = MOST_CONNECTIONS
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)
@@ -120,7 +122,7 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
         """In a thread of its own; who comes on top of those that there may be is closed."""
         asker = client_address[0]
         with self._lock:
-            full = self._open.total() >= MOST_CONNECTIONS or self._open[asker] >= MOST_OF_ONE
+            full = self._open.total() >= self.most or self._open[asker] >= self.most // 2
             if not full:
                 self._open[asker] += 1
         if full:
@@ -156,19 +158,23 @@ class SlaveServer:
         port: Where it listens.
     """
 
-    def __init__(self, api: NodeApi, bind: str, trusts: Callable[[str], bool] | None = None) -> None:
+    def __init__(
+        self, api: NodeApi, bind: str, trusts: Callable[[str], bool] | None = None, most: int = MOST_CONNECTIONS
+    ) -> None:
         """Listen.
 
         Args:
             api: Answers.
             bind: Address to listen on.
             trusts: Whether an address is the master's; found by its name unless given.
+            most: Connections at a time.
 
         Raises:
             OSError: The address is not this machine's.
         """
         self._server = _Server((bind, 0), _Handler, allow_none=True, logRequests=False)
         self._server.trusts = trusts or MasterHost(api.master_uri)
+        self._server.most = most
         self.port: int = self._server.server_address[1]
         for name, function in _methods(api).items():
             self._server.register_function(function, name)

@@ -30,8 +30,9 @@ from ..inbox import Inbox, Topics
 from ..ros.gate_io import RosGateNode, RosSensors, RosWheels, not_acknowledged, twist_of
 from .sections import Ros1Way
 
-_CONNECTIONS = 192
-"""Of one node: a process of the gate has two, and 1,024 file descriptors."""
+_CONNECTIONS = 128
+"""Of one node, twice (`Node`), and 100 more are taken before they are counted: a process of the gate has two nodes, and
+1,024 file descriptors."""
 _MOST_TWINS = 256
 """Names that are remembered: somebody may make them up."""
 
