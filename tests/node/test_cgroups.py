@@ -7,6 +7,7 @@ import subprocess
 
 import pytest
 
+from skytether.node import cgroups
 from skytether.node.cgroups import Cgroups
 
 ONE, OTHER, POD, OLD = ("1" * 64, "2" * 64, "3" * 64, "4" * 64)
@@ -78,10 +79,14 @@ def test_it_says_what_ends_them(root):
     assert Cgroups(root).kill(ONE) == f"kill -9 $(cat {root}/pids/docker/{ONE}/cgroup.procs)"
 
 
-def test_processes_of_one_are_ended(root):
+def test_processes_of_one_are_ended(root, tmp_path, monkeypatch):
+    monkeypatch.setattr(cgroups, "PROC", tmp_path)
     with subprocess.Popen(["sleep", "60"]) as one, subprocess.Popen(["sleep", "60"]) as other:
+        for process, container in ((one, ONE), (other, OTHER)):  # the other one's number was another's
+            (tmp_path / str(process.pid)).mkdir()
+            (tmp_path / str(process.pid) / "cgroup").write_text(f"4:pids:/docker/{container}\n")
         # 0: it is of a computer that this one is within, and would be this program's own group
-        (root / "pids" / "docker" / ONE / "cgroup.procs").write_text(f"0\n{one.pid}\n")
+        (root / "pids" / "docker" / ONE / "cgroup.procs").write_text(f"0\n{one.pid}\n{other.pid}\n1{one.pid}\n")
         Cgroups(root).end(ONE)
         Cgroups(root).end("5" * 64)
         assert one.wait(10) == -signal.SIGKILL

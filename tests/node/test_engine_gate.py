@@ -196,7 +196,7 @@ class Groups(Cgroups):
 @pytest.fixture
 def engine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Engine]:
     monkeypatch.setattr("skytether.node.removals.Cgroups", lambda: Cgroups(tmp_path))  # those of this machine's own
-    monkeypatch.setattr("skytether.node.joins.Cgroups", lambda: Groups(tmp_path))
+    monkeypatch.setattr("skytether.node.join_watch.Cgroups", lambda: Groups(tmp_path))
     monkeypatch.setattr("skytether.node.joins.shims.stop", lambda *_: True)  # its containers have no processes
     monkeypatch.setattr("skytether.node.removals._QUIET_S", 0.0)  # no program was there before
     with tempfile.TemporaryDirectory(prefix="sky-") as folder:
@@ -876,7 +876,7 @@ def test_a_container_that_no_engine_lets_go_of_holds_up_nobody_else(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its seccomp profile had it hang as it started; then a node that was started anew never made anything again."""
-    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.1)
+    monkeypatch.setattr("skytether.node.removals.PATIENCE_S", 0.1)
     joins = {"HostConfig": {"ReadonlyRootfs": True, "NetworkMode": f"container:{X}"}, "Mounts": []}
     engine.running, engine.others = {X, Z}, {X: in_volumes("skytether-s"), Y: in_volumes("skytether-t"), Z: joins}
     engine.paused = {X}
@@ -1047,7 +1047,7 @@ def test_who_joins_by_what_an_earlier_program_asked_for_is_ended_where_that_ende
     engine: Engine, ended: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It was in the network of the machine for good: an engine says nothing of one that it just starts."""
-    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.2)
+    monkeypatch.setattr("skytether.node.removals.PATIENCE_S", 0.2)
     monkeypatch.setattr("skytether.node.removals._QUIET_S", 1.0)
     engine.others = {X: in_volumes(), Y: in_volumes(network=f"container:{X}")}
     engine.idle, engine.slow = {X, Y}, {f"GET /containers/{Y}/json": threading.Event()}
@@ -1257,7 +1257,7 @@ def test_processes_that_go_on_without_a_container_keep_volumes_and_are_named(
     engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After the node was started anew, too; an engine that says nothing of them says not that it has them."""
-    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.1)
+    monkeypatch.setattr("skytether.node.removals.PATIENCE_S", 0.1)
     group = tmp_path / "pids" / "docker" / Z
     group.mkdir(parents=True)
     (tmp_path / "pids" / "cgroup.procs").write_text("")
@@ -1302,7 +1302,7 @@ def test_of_what_was_there_before_nobody_knows_whom_it_met(
     engine: Engine, state: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The node's program was started anew: it has not seen what met until then, and what was just being started."""
-    monkeypatch.setattr("skytether.node.removals._SETTLED_S", 0.2)
+    monkeypatch.setattr("skytether.node.removals.PATIENCE_S", 0.2)
     engine.volumes = [{"Name": OWN}, {"Name": "skytether-s"}]
     new = "8" * 64
     engine.others = {X: in_volumes(OWN), Y: in_volumes(new), Z: in_volumes()}

@@ -12,7 +12,7 @@ import re
 import signal
 from pathlib import Path
 
-ROOT = Path("/sys/fs/cgroup")
+ROOT, PROC = Path("/sys/fs/cgroup"), Path("/proc")
 _HIERARCHIES = ("pids", "memory", "systemd", ".")
 """Where a container's group may be; the last is the only one of version 2."""
 _NAME = re.compile(r"(docker-)?(?:[a-z]+-)?([0-9a-f]{64})(?:\.scope)?")
@@ -45,13 +45,13 @@ class Cgroups:
         return f"kill -9 $(cat {groups})"
 
     def end(self, container: str) -> None:
-        """End its processes, those that this user's program may; may be called again."""
+        """End its processes, those that this program may; may be called again."""
         for folder in self._folders.get(container, {}):
             with contextlib.suppress(OSError):
-                for line in (folder / "cgroup.procs").read_text().split():
-                    if (number := int(line)) > 0:  # 0: it is of a computer that this one is within
-                        with contextlib.suppress(ProcessLookupError, PermissionError):
-                            os.kill(number, signal.SIGKILL)
+                for number in (folder / "cgroup.procs").read_text().split():
+                    with contextlib.suppress(OSError):  # it has just ended; or it is another user's
+                        if container.encode() in (PROC / number / "cgroup").read_bytes():  # it is the same one still
+                            os.kill(int(number), signal.SIGKILL)
 
     def of_docker(self) -> set[str]:
         """Containers that an engine of Docker made, or may have."""

@@ -9,17 +9,16 @@ joins is ended as soon as it has a process.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections import Counter
-from collections.abc import Awaitable, Callable, Collection, Iterable
+from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from itertools import chain, repeat
-from typing import Self, TypeVar
+from typing import TypeVar
 
 from . import shims
-from .asking import begun, conflict, state_of
-from .cgroups import Cgroups
+from .asking import begun, conflict
+from .join_watch import JoinWatch, Life
 from .machine import Answer, ask_long
 
 log = logging.getLogger(__name__)
@@ -29,12 +28,6 @@ _WAIT_S = 30.0
 """For those that just join, before one is ended."""
 _TRY_S = (0.0, 0.1, 1.0, 5.0, 10.0)
 """Between tries to have a container go on that was paused, or ended."""
-_LOOK_S = 0.02
-"""Between looks whether the one whose network is joined has ended."""
-_LONG_S, _PATIENCE_S = 10.0, 3.0
-"""How long a start usually takes at most, and an engine to say what a container is."""
-_MOST_SILENT = 3
-"""Times that it says nothing, one after the other, until it is sure that it does not just take its time."""
 _MOST_JOIN, _MOST_ENDING = 4, 16
 """In line for one network, and calls under way by which one container may end: an engine may take its time for each,
 and whoever asked may be gone meanwhile."""
@@ -46,61 +39,8 @@ _HAS_ENDED = (
 _ENDED = "the container whose network it joined ended meanwhile: it was ended, too"
 
 
-def _end_processes(containers: Iterable[str]) -> list[str]:
-    """Those that have some."""
-    with contextlib.suppress(OSError):
-        cgroups = Cgroups()
-        found = [one for one in containers if cgroups.go_on(one)]
-        for one in found:
-            cgroups.end(one)
-        return found
-    return []
-
-
 class BusyError(Exception):
     """It is not done now; in a sentence."""
-
-
-class Life:
-    """Of a container, from now on until it ends: it may be started again after that, and is another one then.
-
-    An engine may say for seconds of one that has ended that it runs. So the kernel is asked, too: its first process is
-    its last, and has its number so long.
-    """
-
-    def __init__(self, engine: str, container: str) -> None:
-        """``engine``: path of its socket. `begin` comes next."""
-        self._engine, self._container = engine, container
-        self._cgroups: Cgroups | None = None
-        self._told: list[object] | None = None
-
-    async def begin(self) -> Self:
-        """Look at it first."""
-        with contextlib.suppress(OSError):
-            self._cgroups = await asyncio.to_thread(Cgroups)
-        self._told = await self._ask()
-        return self
-
-    def has_ended(self) -> bool:
-        """By the kernel's word; so it is, too, where the kernel does not show it."""
-        return self._cgroups is None or not self._cgroups.go_on(self._container)
-
-    async def goes_on(self) -> bool:
-        """Whether it has not ended, as far as is known."""
-        told = await self._ask()  # first: what the kernel says after that is the newer word
-        return self.is_known() and told in (self._told, None) and not self.has_ended()
-
-    def is_known(self) -> bool:
-        """Whether it was there at first."""
-        return self._told is not None and self._told[0] is True
-
-    def first(self) -> object:
-        """The number of its first process, as the engine says it."""
-        return self._told[1] if self._told else None
-
-    async def _ask(self) -> list[object] | None:
-        state = await state_of(self._engine, self._container)
-        return None if state is None else [state.get(key) for key in ("Running", "Pid", "StartedAt")]
 
 
 class Joins:
@@ -160,16 +100,16 @@ class Joins:
         life = await Life(self._engine, joined).begin()
         if not life.is_known():
             raise BusyError("its engine says nothing of the container whose network it joins")
-        held = shims.stop(joined, life.first())  # in no thread: that would go on when this has ended
+        held = shims.stop(joined, life.first())
         if held is False or life.has_ended():
             raise BusyError(_HAS_ENDED)
         self._note(held)
         starts = begun(ask_long(self._engine, path, method="POST"))
-        seeing = begun(self.see_to(joined, (container,), life))
+        watch = JoinWatch(self._engine, joined, (container,), life)
         try:
             await asyncio.wait((starts,))
         finally:
-            seeing.cancel()
+            watch.close()
         if not await life.goes_on():
             await self.end_joined(container)
             return conflict(_ENDED)
@@ -205,51 +145,12 @@ class Joins:
                 "who joins a network whose container ends in that moment may be in this machine's until it is ended"
             )
 
-    async def see_to(self, joined: str, joining: Collection[str], life: Life) -> None:
-        """What is to be done while an engine may start some that join a container's network; until it is cancelled.
-
-        Args:
-            joined: That container.
-            joining: Those that it may start, and that do not run yet.
-            life: Of that container, since before their starts.
-        """
-        letting = begun(self._let_end(joined, joining))
-        killing: dict[str, asyncio.Task[bool]] = {}
-        went_on = not life.has_ended()
-        try:
-            while True:
-                await asyncio.sleep(_LOOK_S)
-                if went_on and life.has_ended():
-                    for one in await asyncio.to_thread(_end_processes, joining):  # mostly before its program is there
-                        if one not in killing or killing[one].done():  # its engine does it when it has started it
-                            killing[one] = begun(self._kill(one))
-        finally:
-            letting.cancel()
-
-    async def _let_end(self, joined: str, joining: Collection[str]) -> None:
-        """See to it that an engine ends a container, where somebody else asked it to.
-
-        It waits for the shim then, and says nothing of that container; a start that has to ask for it waits, too. Once
-        a start goes on without that, the number stays taken until it has ended, and it is not let take much longer.
-        But whoever asked is not kept waiting for good.
-        """
-        silent = 0
-        while True:
-            await asyncio.sleep(_LONG_S)
-            said = await state_of(self._engine, joined, patience=_PATIENCE_S)
-            silent = silent + 1 if said is None else 0
-            with contextlib.suppress(OSError):
-                if silent >= _MOST_SILENT:
-                    await asyncio.to_thread(_end_processes, joining)
-                if silent > _MOST_SILENT or (silent and not await asyncio.to_thread(shims.is_any, joining)):
-                    await asyncio.to_thread(shims.resume, joined)
-
     async def _go_on(self, container: str) -> None:
         refused = 0
         for wait_s in chain(_TRY_S, repeat(_TRY_S[-1])):
             await asyncio.sleep(wait_s)
             try:
-                await asyncio.to_thread(shims.resume, container)  # nobody has a container go on without it
+                shims.resume(container)  # nobody has a container go on without it
                 answer = await ask_long(self._engine, f"/containers/{container}/unpause", method="POST")
             except (OSError, ValueError):
                 continue  # it will be back, perhaps with all that ran

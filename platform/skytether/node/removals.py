@@ -21,10 +21,12 @@ from math import inf
 from typing import Any, TypeVar
 from urllib.parse import urlencode
 
+from . import shims
 from .asking import begun, conflict, state_of
 from .cgroups import Cgroups
 from .engine_rules import LOOKS, NOBODY, OWNER
-from .joins import BusyError, Joins, Life
+from .join_watch import PATIENCE_S, JoinWatch, Life
+from .joins import BusyError, Joins
 from .kin import Kin
 from .machine import Answer, TooMuchError, ask_long, ask_soon, lean, listed, picked
 
@@ -35,8 +37,6 @@ _LOOK_BACK_S = 15.0
 """In which containers are asked for, one by one, whether they run; after that, each is taken to."""
 _WAIT_S = 30.0
 """For a removal of what a start has to do with."""
-_SETTLED_S = 3.0
-"""For an engine to say what a container is that it does not start just now."""
 _QUIET_S = 15.0
 """For what an earlier program asked for to begin at the engine: starts, removals, and what pauses or ends a container.
 Of what ends one there are few, and an engine is at these in turn."""
@@ -299,12 +299,12 @@ class Removals:
 
     async def _is_said_to_run(self, container: str) -> bool:
         """Of one that an engine starts it says nothing."""
-        state = await state_of(self._engine, container, patience=_SETTLED_S)
+        state = await state_of(self._engine, container, patience=PATIENCE_S)
         return state is not None and state.get("Running") is not False
 
     async def _is_paused(self, container: str) -> bool:
         """Whether it is, or may be."""
-        state = await state_of(self._engine, container, patience=_SETTLED_S)
+        state = await state_of(self._engine, container, patience=PATIENCE_S)
         return state is None or state.get("Paused") is not False
 
     async def _until_joined(self, container: str, joining: Iterable[str]) -> None:
@@ -315,18 +315,32 @@ class Removals:
             joining: Those that are to be in its network.
         """
         life = await Life(self._engine, container).begin()
-        idle = {one for one in joining if not await self._is_said_to_run(one)}  # a start of theirs may be under way
-        seeing = begun(self._joins.see_to(container, idle, life))
+        idle = await self._idle(joining)  # a start of theirs may be under way
+        watch = JoinWatch(self._engine, container, idle, life, first_look_s=0.0)
         try:
             for one in joining:
                 while await self._runs(one) is False and time.monotonic() < self._quiet_from:
                     await asyncio.sleep(_IDLE_S)
                 while not await self._is_told_of(one):
-                    await asyncio.sleep(_SETTLED_S)
+                    await asyncio.sleep(PATIENCE_S)
                 if one in idle and await self._runs(one) and not await life.goes_on():
                     await self._joins.end_joined(one)
+                watch.has_joined(one)
         finally:
-            seeing.cancel()
+            watch.close()
+        with contextlib.suppress(OSError):
+            shims.resume(container)
+
+    async def _idle(self, containers: Iterable[str]) -> set[str]:
+        """Those that an engine does not say to run; all are asked for at once, for of some it may say nothing."""
+        turns, containers = asyncio.Semaphore(_MOST_ASKED), list(containers)
+
+        async def runs(container: str) -> bool:
+            async with turns:
+                return await self._is_said_to_run(container)
+
+        told = await asyncio.gather(*map(runs, containers))
+        return {one for one, running in zip(containers, told, strict=True) if not running}
 
     async def _look_again(self) -> None:
         """When all has begun that an earlier program asked for: it may have paused one after the list was told."""
@@ -386,7 +400,7 @@ class Removals:
         nothing of one that it starts just now, as an earlier program may have asked it to.
         """
         try:
-            answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+            answer = await ask_soon(self._engine, f"/containers/{container}/json", patience=PATIENCE_S)
             if answer.status == HTTPStatus.NOT_FOUND:
                 return None
             return picked(answer.content, "State", "Running")["State"]["Running"] is not False
@@ -421,7 +435,7 @@ class Removals:
                 gone = True
                 with contextlib.suppress(OSError, ValueError):  # who says nothing says not that it knows it
                     path = f"/containers/{container}/json"
-                    answer = await ask_soon(self._engine, path, patience=_SETTLED_S)
+                    answer = await ask_soon(self._engine, path, patience=PATIENCE_S)
                     gone = answer.status == HTTPStatus.NOT_FOUND
                 if gone and self._goes_on(container, cgroups):
                     found.add(container)
@@ -430,7 +444,7 @@ class Removals:
     async def _is_told_of(self, container: str) -> bool:
         """Whether an engine says anything of it: not while it starts it."""
         try:
-            await ask_soon(self._engine, f"/containers/{container}/json", patience=_SETTLED_S)
+            await ask_soon(self._engine, f"/containers/{container}/json", patience=PATIENCE_S)
         except (OSError, ValueError):
             return False
         return True

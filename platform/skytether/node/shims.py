@@ -56,15 +56,21 @@ def stop(container: str, first: object, proc: Path = PROC) -> bool | None:
         return False
 
 
-def resume(container: str, proc: Path = PROC) -> None:
+def resume(container: str, proc: Path = PROC) -> bool:
     """What `stop` did is undone, whatever program did it. May be called again.
+
+    Returns:
+        Whether it was stopped.
 
     Raises:
         OSError: It cannot be found out now, for want of open files, say.
     """
+    stopped = False
     for number in _shims_of((container,), proc):
-        with contextlib.suppress(ProcessLookupError, PermissionError):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError, PermissionError):
+            stopped = _stat(proc / str(number))[0] == "T" or stopped
             os.kill(number, signal.SIGCONT)
+    return stopped
 
 
 def is_any(containers: Collection[str], proc: Path = PROC) -> bool:

@@ -24,14 +24,14 @@ After=network-online.target docker.service
 StartLimitIntervalSec=0
 
 [Service]
-# Root without any right but to read: the engine's socket is root's, and whoever may use it is root anyway; reports are
-# in volumes that belong to services.
+# Root without any right but to read and to end processes: the engine's socket is root's, and whoever may use it is root
+# anyway. Reports are in volumes that belong to services, and a container that may be in the machine's network is ended.
 ExecStart={program} site run --folder {folder}
 Restart=always
 RestartSec=2
 UMask=0077
 NoNewPrivileges=yes
-CapabilityBoundingSet=CAP_DAC_READ_SEARCH
+CapabilityBoundingSet=CAP_DAC_READ_SEARCH CAP_KILL
 ProtectSystem=strict
 ReadWritePaths={folder}
 ProtectHome={home}

@@ -141,12 +141,12 @@ def test_connections_that_say_nothing_keep_nobody_out(graph):
     with Node("skytether", graph.uri, connections=4) as node, ExitStack() as stack:
         ours = node.advertise("/ours", STRING, MD5)
         address = node.offered("/ours")
-        silent = [stack.enter_context(socket.create_connection(address)) for _ in range(9)]
+        silent = [stack.enter_context(socket.create_connection(address, 10)) for _ in range(9)]
         assert [sock.recv(1) for sock in silent[:5]] == [b""] * 5, "the oldest have gone"
         listener = graph.python(LISTENER, "listener", "/ours", stdout=subprocess.PIPE)
         wait_for(lambda: ours.subscribers == ["/listener"], "the listener")
         for _ in range(9):
-            stack.enter_context(socket.create_connection(address))
+            stack.enter_context(socket.create_connection(address, 10))
         ours.publish(encode(String("on"), "ros1"))
         assert listener.stdout.readline() == b"on\n"
 

@@ -87,7 +87,7 @@ def test_the_units_are_ones_that_systemd_takes(tmp_path, source):
 @pytest.mark.usefixtures("systemd")
 @pytest.mark.parametrize(
     ("source", "tenths"),
-    [(UNITS[0], 26), (UNITS[1], 26), (ORCHESTRATOR, 19), (NODE, 20)],
+    [(UNITS[0], 26), (UNITS[1], 26), (ORCHESTRATOR, 19), (NODE, 21)],
     ids=["robot", "gate", "orchestrator", "node"],
 )
 def test_the_units_are_scored(source, tenths):
