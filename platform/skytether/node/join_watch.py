@@ -89,11 +89,11 @@ class JoinWatch:
         joined: That container.
         joining: Those that an engine may start just now.
         life: Of that container, since before their starts.
-        first_look_s: Until the engine is first asked whether it waits [s].
+        first_look_s: Until the engine is first asked whether it waits [s]; None: as long as a start usually takes.
     """
 
     def __init__(
-        self, engine: str, joined: str, joining: Collection[str], life: Life, first_look_s: float = _LONG_S
+        self, engine: str, joined: str, joining: Collection[str], life: Life, first_look_s: float | None = None
     ) -> None:
         self._engine, self._joined, self._joining, self._life = engine, joined, set(joining), life
         there = _with_processes(self._joining)
@@ -101,7 +101,7 @@ class JoinWatch:
         """Those whose processes are of a start that goes on since."""
         self._silent = 0
         self._killing: dict[str, asyncio.Task[object]] = {}
-        self._tasks = (begun(self._watch()), begun(self._let_end(first_look_s)))
+        self._tasks = (begun(self._watch()), begun(self._let_end(_LONG_S if first_look_s is None else first_look_s)))
 
     def has_joined(self, container: str) -> None:
         """It is not looked after any more."""

@@ -33,8 +33,8 @@ _WRITTEN_BYTES = 2**16
 _HANDOVER = 1000
 """Messages on the way from other threads to the node's; they wait there for milliseconds."""
 _MAX_SUBSCRIBERS = 256
-_MISSED_S, _MOST_MISSED = 1.0, 5
-"""Until a node is told anew that this one publishes, doubled each time, and how often it is."""
+_MISSED_S, _MOST_DOUBLED = 1.0, 5
+"""Until a node is told anew that this one publishes, doubled each time, but no more often than that."""
 _MOST_UNREAD = 4096
 """Frames of which it is known when they were put."""
 
@@ -279,6 +279,7 @@ class Publication:
         try:
             while await reader.read(4096):
                 pass
+            writer.transport.abort()  # it may read no more, and what waits for that would keep the file descriptor
         finally:
             self._subscribers.remove(subscriber)
             if caller not in self.subscribers:
@@ -308,9 +309,9 @@ class Publication:
         now = self._clock()
         due = [name for name, (_, at) in list(self._missed.items()) if at <= now]
         for name in due:
-            tried, _ = self._missed.pop(name, (_MOST_MISSED, now))
-            if tried < _MOST_MISSED and name not in self.subscribers:
-                self._missed[name] = (tried + 1, now + _MISSED_S * 2 ** (tried + 1))
+            tried, _ = self._missed.pop(name, (0, now))
+            if name not in self.subscribers:
+                self._missed[name] = (tried + 1, now + _MISSED_S * 2 ** min(tried + 1, _MOST_DOUBLED))
         left = [name for name in due if name in self._missed]
         known = wanted() if left else ()
         for name in left:
