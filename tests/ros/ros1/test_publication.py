@@ -176,7 +176,7 @@ def test_who_reads_no_more_and_ends_keeps_no_descriptor():
 
     async def work(publication, connect):
         before = len(os.listdir("/proc/self/fd"))
-        reader, writer, _ = await connect()
+        _, writer, _ = await connect()
         writer.transport.pause_reading()
         for _ in range(50):
             publication.publish(bytes(100_000))
