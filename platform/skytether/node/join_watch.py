@@ -44,11 +44,11 @@ class Life:
         self.went_on = False
         """Whether it had not ended at first, by the kernel's word."""
 
-    async def begin(self) -> Self:
-        """Look at it first."""
+    async def begin(self, **how: float) -> Self:
+        """Look at it first; ``how``: as `state_of`."""
         with contextlib.suppress(OSError):
             self._cgroups = Cgroups()
-        self._told = await self._ask()
+        self._told = await self._ask(**how)
         self.went_on = not self.has_ended()
         return self
 
@@ -70,8 +70,8 @@ class Life:
         """The number of its first process, as the engine says it."""
         return self._told[1] if self._told else None
 
-    async def _ask(self) -> list[object] | None:
-        state = await state_of(self._engine, self._container, patience=PATIENCE_S)
+    async def _ask(self, **how: float) -> list[object] | None:
+        state = await state_of(self._engine, self._container, **how)
         return None if state is None else [state.get(key) for key in ("Running", "Pid", "StartedAt")]
 
 

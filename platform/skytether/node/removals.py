@@ -314,7 +314,7 @@ class Removals:
             container: Its id.
             joining: Those that are to be in its network.
         """
-        life = await Life(self._engine, container).begin()
+        life = await Life(self._engine, container).begin(patience=PATIENCE_S)
         idle = await self._idle(joining)  # a start of theirs may be under way
         watch = JoinWatch(self._engine, container, idle, life, first_look_s=0.0)
         try:
