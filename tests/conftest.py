@@ -107,7 +107,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(f"{seconds:.2f}s {name}")
     for report in terminalreporter.stats.get("rerun", ()):
         why = getattr(getattr(report.longrepr, "reprcrash", None), "message", report.longrepr)
-        terminalreporter.write_line(f"run again: {report.nodeid}, for {' '.join(str(why).split())[:500]}")
+        terminalreporter.write_line(f"run again: {report.nodeid}, for {' '.join(str(why).split())[:3000]}")
 
 
 def require(name: str, reason: str) -> NoReturn:

@@ -43,7 +43,8 @@ def robot(tmp_path: Path) -> Iterator[PlayedRobot]:
 def check(stage: Stage) -> None:
     """Nothing that was promised was broken since the stage was made."""
     finding = stage.finding()
-    assert not finding.violations, "\n".join(f"{v.kind} ({v.times}): {v.text}" for v in finding.violations)
+    log = stage.robot.log.read_text(errors="replace")[-4000:] if finding.violations else ""
+    assert not finding.violations, "\n".join([*(f"{v.kind} ({v.times}): {v.text}" for v in finding.violations), log])
 
 
 def freeze(robot: PlayedRobot, role: str, seconds: float) -> None:
