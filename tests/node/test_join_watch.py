@@ -27,7 +27,7 @@ class Machine:
         monkeypatch.setattr(join_watch, "Cgroups", lambda: Cgroups(root))
         monkeypatch.setattr(Cgroups, "end", lambda _, one: self.done.append(("end", one)))
         monkeypatch.setattr(join_watch, "ask_soon", self.ask)
-        monkeypatch.setattr(join_watch, "ask_long", self.kill)
+        monkeypatch.setattr(join_watch, "killed", self.kill)
         monkeypatch.setattr(join_watch, "state_of", self.state)
         monkeypatch.setattr(join_watch, "_LONG_S", 0.0)
         monkeypatch.setattr(join_watch, "_LOOK_S", 0.0)
@@ -47,8 +47,8 @@ class Machine:
         if self.says is not None:
             raise self.says
 
-    async def kill(self, _, path, **__):
-        self.done.append(("kill", path.split("/")[2]))
+    async def kill(self, _, container):
+        self.done.append(("kill", container))
 
     async def state(self, *_, **__):
         return {"Running": True}

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from http import HTTPStatus
@@ -82,11 +82,7 @@ def test_who_joins_the_network_of_one_that_ends_meanwhile_is_in_no_other(
     number = int(json.loads(ask(ENGINE, f"/containers/{holds}/json").content)["State"]["Pid"])
     stat = Path(f"/proc/{number}/stat")
     with ThreadPoolExecutor() as pool, ExitStack() as after:
-        said = pool.submit(gated.ask, f"POST /containers/{joins}/start")
-        while not (runtime := _runtime_of(joins)):
-            assert not said.done()
-        os.kill(runtime, signal.SIGSTOP)
-        after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
+        said, runtime = _stopped_in(gated, joins, pool, after)
         os.kill(number, signal.SIGKILL)
         for freezer in Path("/sys/fs/cgroup").glob(f"freezer/**/*{holds}*/freezer.state"):
             freezer.write_text("THAWED")
@@ -167,11 +163,7 @@ def test_somebody_else_ends_it_only_when_who_joins_is_in_its_network_or_nowhere(
     joins, _ = gated.make(network=f"container:{holds}", starts=False)
     number = int(json.loads(ask(ENGINE, f"/containers/{holds}/json").content)["State"]["Pid"])
     with ThreadPoolExecutor() as pool, ExitStack() as after:
-        said = pool.submit(gated.ask, f"POST /containers/{joins}/start")
-        while not (runtime := _runtime_of(joins)):
-            assert not said.done()
-        os.kill(runtime, signal.SIGSTOP)
-        after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
+        said, runtime = _stopped_in(gated, joins, pool, after)
         ends = pool.submit(ask, ENGINE, f"/containers/{holds}/kill?signal=KILL", method="POST", patience=60)
         time.sleep(3.0)  # longer than it waits for before it lets that one end, were there no start under way
         assert Path(f"/proc/{number}").exists()
@@ -183,6 +175,16 @@ def test_somebody_else_ends_it_only_when_who_joins_is_in_its_network_or_nowhere(
         assert b"ended meanwhile" in said.result(30).content
     state = json.loads(ask(ENGINE, f"/containers/{joins}/json").content)["State"]
     assert state["Running"] is False
+
+
+def _stopped_in(gated: Gated, container: str, pool: Executor, after: ExitStack) -> tuple[Future[Answer], int]:
+    """A start that stands still in what makes the container; that one's number, and that it goes on in the end."""
+    said = pool.submit(gated.ask, f"POST /containers/{container}/start")
+    while not (runtime := _runtime_of(container)):
+        assert not said.done()
+    os.kill(runtime, signal.SIGSTOP)
+    after.callback(lambda: Path(f"/proc/{runtime}").exists() and os.kill(runtime, signal.SIGCONT))
+    return said, runtime
 
 
 def _runtime_of(container: str) -> int | None:

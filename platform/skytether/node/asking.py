@@ -8,7 +8,7 @@ from collections.abc import Coroutine, Mapping
 from http import HTTPStatus
 from typing import Any, TypeVar
 
-from .machine import Answer, ask_soon, lean, picked
+from .machine import Answer, ask_long, ask_soon, lean, picked
 
 _T = TypeVar("_T")
 _STATE = "Running", "Paused", "Pid", "StartedAt"
@@ -64,6 +64,15 @@ async def state_of(engine: str, container: str, **how: Any) -> Mapping[str, Any]
         return dict(picked(answer.content, "State", *_STATE)["State"])
     except (OSError, ValueError, LookupError, TypeError):
         return None
+
+
+async def killed(engine: str, container: str) -> bool:
+    """Have an engine end a container; says whether it does not run any more."""
+    try:
+        answer = await ask_long(engine, f"/containers/{container}/kill?signal=KILL", method="POST")
+    except (OSError, ValueError):
+        return False
+    return answer.status < HTTPStatus.INTERNAL_SERVER_ERROR
 
 
 def begun(work: Coroutine[Any, Any, _T]) -> asyncio.Task[_T]:

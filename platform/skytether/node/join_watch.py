@@ -12,9 +12,9 @@ from collections.abc import Collection
 from typing import Self
 
 from . import shims
-from .asking import begun, state_of
+from .asking import begun, killed, state_of
 from .cgroups import Cgroups
-from .machine import ask_long, ask_soon
+from .machine import ask_soon
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class JoinWatch:
         self._new = self._joining - there
         """Those whose processes are of a start that goes on since."""
         self._silent = 0
-        self._killing: dict[str, asyncio.Task[object]] = {}
+        self._killing: dict[str, asyncio.Task[bool]] = {}
         self._tasks = (begun(self._watch()), begun(self._let_end(_LONG_S if first_look_s is None else first_look_s)))
 
     def has_joined(self, container: str) -> None:
@@ -119,8 +119,7 @@ class JoinWatch:
             if self._joining and self._life.went_on and self._life.has_ended():
                 for one in _end_processes(self._joining):  # of another user's, the engine does it when it has started
                     if one not in self._killing or self._killing[one].done():
-                        path = f"/containers/{one}/kill?signal=KILL"
-                        self._killing[one] = begun(ask_long(self._engine, path, method="POST"))
+                        self._killing[one] = begun(killed(self._engine, one))
 
     async def _let_end(self, first_look_s: float) -> None:
         await asyncio.sleep(first_look_s)

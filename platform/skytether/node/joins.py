@@ -17,7 +17,7 @@ from itertools import chain, repeat
 from typing import TypeVar
 
 from . import shims
-from .asking import begun, conflict
+from .asking import begun, conflict, killed
 from .join_watch import JoinWatch, Life
 from .machine import Answer, ask_long
 
@@ -124,18 +124,10 @@ class Joins:
         """End one that may be in another network than the one that it was to join."""
         for wait_s in _TRY_S:
             await asyncio.sleep(wait_s)
-            if await self._kill(container):
+            if await killed(self._engine, container):
                 log.warning("container %s was ended: the one whose network it joined ended meanwhile", container)
                 return
         log.error("container %s may be in the network of this machine: docker kill %s", container, container)
-
-    async def _kill(self, container: str) -> bool:
-        """Whether it does not run any more."""
-        try:
-            answer = await ask_long(self._engine, f"/containers/{container}/kill?signal=KILL", method="POST")
-        except (OSError, ValueError):
-            return False
-        return answer.status < HTTPStatus.INTERNAL_SERVER_ERROR
 
     def _note(self, held: bool | None) -> None:
         if held is None and not self._noted:

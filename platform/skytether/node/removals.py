@@ -307,7 +307,7 @@ class Removals:
         state = await state_of(self._engine, container, patience=PATIENCE_S)
         return state is None or state.get("Paused") is not False
 
-    async def _until_joined(self, container: str, joining: Iterable[str]) -> None:
+    async def _until_joined(self, container: str, joining: Collection[str]) -> None:
         """Wait until a container's network is not being joined any more; who joined another's by that is ended.
 
         Args:
@@ -331,9 +331,9 @@ class Removals:
         with contextlib.suppress(OSError):
             shims.resume(container)
 
-    async def _idle(self, containers: Iterable[str]) -> set[str]:
+    async def _idle(self, containers: Collection[str]) -> set[str]:
         """Those that an engine does not say to run; all are asked for at once, for of some it may say nothing."""
-        turns, containers = asyncio.Semaphore(_MOST_ASKED), list(containers)
+        turns = asyncio.Semaphore(_MOST_ASKED)
 
         async def runs(container: str) -> bool:
             async with turns:

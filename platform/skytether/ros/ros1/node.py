@@ -40,7 +40,7 @@ _HEADER_S = 10.0
 """For a connection to say what it is for."""
 _WORKERS = 16
 """Requests to other nodes, and service calls, at the same time."""
-CONNECTIONS = 1024
+_CONNECTIONS = 1024
 """That a node has from others at a time: each takes a file descriptor."""
 
 
@@ -136,7 +136,7 @@ class Node:
         host: str | None = None,
         on_end: Callable[[str], None] | None = None,
         look_s: float = LOOK_S,
-        connections: int = CONNECTIONS,
+        connections: int = _CONNECTIONS,
     ) -> None:
         self.name = resolve(name, "/")
         self.master_uri = master_uri
@@ -151,7 +151,7 @@ class Node:
         self._publications: dict[str, _Published] = {}
         self._services: dict[str, _Served] = {}
         self._connections: set[asyncio.Task[None]] = set()
-        self._silent: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self._silent: dict[asyncio.StreamWriter, None] = {}
         """Of these, in the order in which they came, those that have not said what they are for."""
         self._most_connections = connections
         self._loop = asyncio.new_event_loop()
@@ -397,23 +397,16 @@ class Node:
 
     def _on_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._connections) >= self._most_connections:
-            if not self._silent:
+            oldest = next(iter(self._silent), None)
+            if oldest is None:
                 writer.close()
                 return
-            self._end_oldest()
+            del self._silent[oldest]
+            oldest.close()  # what serves it ends by that
+        self._silent[writer] = None
         task = self._loop.create_task(self._guarded(self._serve(reader, writer), writer))
         self._connections.add(task)
-        self._silent[task] = writer
-        task.add_done_callback(self._forget)
-
-    def _end_oldest(self) -> None:
-        connection, writer = next(iter(self._silent.items()))
-        writer.close()  # it ends by that
-        self._forget(connection)
-
-    def _forget(self, connection: asyncio.Task[None]) -> None:
-        self._connections.discard(connection)
-        self._silent.pop(connection, None)
+        task.add_done_callback(self._connections.discard)
 
     async def _guarded(self, work: Coroutine[Any, Any, None], writer: asyncio.StreamWriter) -> None:
         try:
@@ -421,14 +414,14 @@ class Node:
         except (OSError, EOFError, HeaderError, TimeoutError):
             pass  # the other side's end or nonsense: its matter
         finally:
+            self._silent.pop(writer, None)
             writer.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         tune(writer)
         async with asyncio.timeout(_HEADER_S):
             header = await read_header(reader)
-        if (own := asyncio.current_task()) is not None:
-            self._silent.pop(own, None)
+        self._silent.pop(writer, None)
         with self._lock:
             service = self._services.get(header.get("service", ""))
             published = self._publications.get(header.get("topic", ""))
